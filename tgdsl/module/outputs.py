@@ -1,4 +1,4 @@
-"""What a module's readings and observations are, and how observations follow from readings.
+"""Readings and observations of a module, and how observations are computed from readings.
 
 Shapes: `env` environments, `step` stacked calls, `row` taxels, bodies, joints or actuators, `channel` numbers per row,
 `feature` numbers of an observation.
@@ -22,11 +22,11 @@ from tgdsl.tensors.buffers import Constants
 
 @dataclass(frozen=True)
 class Output:
-    """One reading: its name, its sensor and that one's kind, its shape after `env`, and name and unit of each channel.
+    """One reading: name, sensor, kind of the sensor, shape after `env`, and name and unit of each channel.
 
-    The shape is (row, channel), or (step, row, channel) where calls, or samples of a block, are stacked. Rows are the sensor's
-    taxels (`rows` is "taxel"), the bodies that carry it ("body"), or what its kind says: see `TactileModule.rows`. `bodies`
-    lists the bodies. A reading that no sensor makes has its own name for sensor and kind; its rows are those of `inputs.joints`
+    The shape is (row, channel), or (step, row, channel) if calls, or samples of a block, are stacked. Rows are the sensor's
+    taxels (`rows` is "taxel"), the bodies that carry it ("body"), or other rows of its kind: see `TactileModule.rows`. `bodies`
+    lists the bodies. A reading of joints or actuators has its own name as sensor and kind, and the rows of `inputs.joints`
     ("joint") or `inputs.actuators` ("actuator").
     """
 
@@ -56,11 +56,11 @@ class ObservationTerm:
     """One term of an observation group.
 
     Attributes:
-        name: The reading that is observed, or the type where there is none; `<name>[<i>]` where several terms of the group have
-            that name, i being the term's number.
+        name: The observed reading, or the type if there is none; `<name>[<i>]` with the term's index if several terms of the
+            group share the name.
         type: Its type.
-        size: How many features it gives.
-        slice: Where they stand among the group's.
+        size: Number of features.
+        slice: Slice of its features in the group.
     """
 
     name: str

@@ -1,9 +1,9 @@
-"""Environments in which touch can be learned: a task, its module and a simulation as one step.
+"""Environments for learning with touch: a task, its module and a simulation in one step.
 
-One control step, in this order: the action becomes targets; forces that push begin or end; physics steps, each with its drive;
-readings of one instant; is it over; rewards; and then the environments that have ended begin again: what is random is drawn,
-they are placed, and they alone are read again, without a move of anyone else's delay, noise or history. On a GPU all of it is
-one CUDA graph, and the host never waits.
+A control step has this order: the action sets targets; pushes begin or end; physics steps, each with the drives; readings of
+one instant; terminations; rewards. Then environments whose episodes ended start again: random values are drawn, bodies are
+placed, and these environments alone are read again; delay, noise and history of the others do not advance. On a GPU the whole
+step is one CUDA graph, and the host never waits.
 
 Shapes: `env` environments, `joint` joints that the policy moves, `feature` numbers of a group.
 """
@@ -51,7 +51,7 @@ Observations = dict[str, Float[Tensor, "env feature"]]
 
 
 class StepInfo(NamedTuple):
-    """Further results of a step. Values of an episode are those of the one that has just ended, where one has."""
+    """Further results of a step. Where an episode has ended, its values are given, not those of the next one."""
 
     ended: Bool[Tensor, " env"]  #: episodes that have ended, terminated or truncated
     final_obs: Observations  #: observations before the reset: they differ from `Step.obs` where an episode has ended
@@ -76,8 +76,8 @@ class Step(NamedTuple):
 
     obs: Observations  #: observations by group; of episodes that have ended, the first of the next one
     reward: Float[Tensor, " env"]  #: sum of the terms
-    terminated: Bool[Tensor, " env"]  #: episodes that have ended for good
-    truncated: Bool[Tensor, " env"]  #: episodes that have merely lasted long enough
+    terminated: Bool[Tensor, " env"]  #: episodes that ended in failure or success
+    truncated: Bool[Tensor, " env"]  #: episodes that ended at their maximum duration
     info: StepInfo  #: further results
 
     def __repr__(self) -> str:
@@ -90,16 +90,16 @@ class TouchEnv:
     Groups of observations: `proprio` (positions [rad], velocities [rad/s] and last action of the joints that the policy moves),
     `tactile_sensors` (none with `touch: none`), `priv_proprio` (`proprio` and the force on each link [N]), and the task's own.
 
-    `curricula.advance` changes numbers of terms while a policy is learned; whoever learns calls it.
+    A learner calls `curricula.advance` to change parameters of terms during training.
 
     Attributes:
         groups: Size of each group of observations.
         felt: Sources of the groups of touch.
         joint_names: Joints that the policy moves, in the order of actions.
         control_step: Duration of a control step [s].
-        max_steps: Control steps of an episode that nothing ends before.
-        steps: Control steps of each environment's present episode: a live tensor, which may be written.
-        resets: How often each environment was reset, from which its random numbers follow: the same.
+        max_steps: Largest number of control steps of an episode.
+        steps: Control steps of each environment's current episode: a live tensor, which may be written.
+        resets: Number of resets of each environment, which selects its random numbers: a live tensor too.
     """
 
     _instant: Now | None
@@ -126,24 +126,24 @@ class TouchEnv:
         """Make the environments and begin an episode in each.
 
         Args:
-            task: The task's document: a YAML file, or the same as a mapping.
+            task: The task's document: a YAML file, or a mapping with its content.
             num_envs: Number of environments.
             device: "cpu" (MuJoCo on its threads) or "cuda", "cuda:1" (MuJoCo Warp).
             seed: Seed of all random numbers.
-            overrides: Values of the document to set first by dotted path, such as `{"rewards.spin": 3}`.
-            simulator: "mujoco", "warp" or one that a package brings; default: by the device. MuJoCo Warp on a CPU is slow, and
-                meant for tests.
+            overrides: Values of the document to replace, by dotted path, such as `{"rewards.spin": 3}`.
+            simulator: "mujoco", "warp" or the name of an installed plug-in; default: by the device. MuJoCo Warp on a CPU is
+                slow, and meant for tests.
             threads: CPU threads of physics; 0: one per CPU.
-            compiled: Whether the module, and all of a step but for physics, is compiled by torch; default: on a GPU.
-            first_env: Index of the first environment among all processes: random numbers and variants follow from it.
-            feels: What several policies feel, each a group of observations `Felt.group`, in place of the document's `touch`,
-                `placement` and `noise`, and of `tactile_sensors`.
-            sensed: The result of `compile_sensed`, instead of the document's sensors; its module is used as it is.
-            progress: Called with a line of text for each long job.
+            compiled: Whether torch compiles the module and the rest of a step, except physics; default: on a GPU.
+            first_env: Index of the first environment across all processes, for random numbers and variants.
+            feels: Touch of several policies, each an observation group `Felt.group`. They replace the document's `touch`,
+                `placement` and `noise`, and the group `tactile_sensors`.
+            sensed: The result of `compile_sensed`, in place of the document's sensors; its module is not copied.
+            progress: Function that takes a line of text about each long job.
 
         Raises:
-            SpecError: All mistakes of the document, at their places.
-            SimulationError: If the scene cannot be simulated as the document says.
+            SpecError: For all mistakes in the document, with their positions.
+            SimulationError: If the scene cannot be simulated with the document's settings.
         """
         device = str(device)
         loaded = self.loaded = task if isinstance(task, LoadedTask) else load_task(task, overrides)
@@ -220,7 +220,7 @@ class TouchEnv:
         """Begin a new episode in all environments.
 
         Args:
-            seed: Seed of all random numbers, as if the environments were made with it; default: go on.
+            seed: Seed of all random numbers, as for new environments; default: continue with the current numbers.
         """
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.sim.qpos.device)
         with torch.inference_mode(False), torch.no_grad():  # memory is written outside of inference mode too
@@ -235,15 +235,15 @@ class TouchEnv:
             return dict(self._obs)
 
     def step(self, action: Float[Tensor, "env joint"] | Float[np.ndarray, "env joint"]) -> Step:
-        """Make one control step in all environments; those whose episodes end begin the next one.
+        """Make one control step in all environments; where an episode ends, the next one begins.
 
         Args:
-            action: What the policy asks for, from −1 to 1: what is beyond is clipped, and warned of if it is far beyond in the
-                first step. An environment with actions that are not finite ends its episode, and is named in `info.faults`.
-                NumPy's arrays are taken too.
+            action: The policy's action, from −1 to 1. Other values are clipped; in the first step a warning names values far
+                outside. An action that is not finite ends the episode, and marks the environment in `info.faults`. NumPy arrays
+                are accepted.
 
         Raises:
-            SimulationError: If an action does not fit or is of integers, or a pool of MuJoCo Warp was too small.
+            SimulationError: If the action has another shape or an integer dtype, or a pool of MuJoCo Warp overflowed.
         """
         try:
             action = torch.as_tensor(action)
@@ -276,12 +276,12 @@ class TouchEnv:
         return describe(self.loaded, self._sensed, self.task, self.curricula.terms, self.groups)
 
     def follow(self, control: Float[Tensor, "env nu"]) -> Step:
-        """Make one control step towards set-points from elsewhere, such as a hand's serial line, without a policy.
+        """Make one control step towards external set-points, such as those of a hand's serial line, without a policy.
 
-        Actions count as zeros. Episodes that end do not begin again: call `reset`.
+        Actions count as zeros. Ended episodes do not restart: call `reset`.
 
         Args:
-            control: Set-points of all actuators, as their joints' positions [rad; slides: m].
+            control: Set-points of all actuators: positions of their joints [rad; slides: m].
         """
         with torch.inference_mode(False), torch.no_grad(), self._dispatch():
             self.actuation.follow(control)
@@ -292,28 +292,28 @@ class TouchEnv:
         return step
 
     def images(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Return the policy's touch as one image per link, and which pixels are taxels: see `TactileModule.images`.
+        """Return the policy's touch as one image per link, and masks of taxels: see `TactileModule.images`.
 
         Raises:
-            SimulationError: If it feels nothing, or there are several; or a state was loaded, and no step made since.
+            SimulationError: If the policy has no touch, there are several policies, or no step followed `load_state_dict`.
         """
         if self._sensed.felt is None:
             raise SimulationError("the policy feels nothing: touch is none; or there are several policies")
         return self.touch.images(self._sensed.felt, self.now.readings)
 
     def state_dict(self) -> dict[str, dict[str, Tensor]]:
-        """Return copies of the whole state of the environments; the policy is not part of it.
+        """Return copies of the environments' whole state, without the policy.
 
-        Another `TouchEnv` of the same document and number of environments goes on from it: on a CPU bit for bit.
+        Another `TouchEnv` with the same document and number of environments continues from it, on a CPU bit for bit.
         """
         memory = self._memory() | {"touch": self.touch.state_dict(), "obs": self._obs}
         return _copied(memory) | {"sim": self.sim.state_dict(), "seed": {"seed": torch.tensor(self._draws.seed)}}
 
     def load_state_dict(self, state: Mapping[str, Mapping[str, Tensor]]) -> Observations:
-        """Restore the state of environments of the same document and number; return the observations there.
+        """Restore a state from environments with the same document and number; return its observations.
 
         Raises:
-            SimulationError: If the state is of other environments; nothing has changed then.
+            SimulationError: If the state is from other environments; nothing is changed then.
         """
         own = self._memory() | {"touch": self.touch.state_dict(), "obs": self._obs, "seed": {"seed": torch.tensor(0)}}
         _refuse_other(own, {part: saved for part, saved in state.items() if part != "sim"})
@@ -329,7 +329,7 @@ class TouchEnv:
         return dict(self._obs)
 
     def close(self) -> None:
-        """Release the module; the environments can no longer be used."""
+        """Release simulator and module; the environments cannot be used afterwards."""
         self.sim.close()
 
     def _memory(self) -> dict[str, dict[str, Tensor]]:
