@@ -24,7 +24,7 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--check-types"):
         from jaxtyping import install_import_hook
 
-        install_import_hook("tgdsl", "beartype.beartype")
+        install_import_hook("tgdsl", "typed_calls.check")
 
 
 @pytest.fixture
