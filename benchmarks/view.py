@@ -1,4 +1,4 @@
-"""What `tgdsl.show` costs a loop: the same steps with and without the page, in blocks that alternate, with a browser connected.
+"""What a page costs a loop or a learner: steps with and without it, in blocks that alternate, with a browser connected.
 
 The browser is a websocket that reads what the page sends and draws nothing.
 """
@@ -11,7 +11,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,23 +20,51 @@ import torch
 import tyro
 
 import tgdsl
+from tgdsl.view.mirror import LoopPage
+
+Opened = tuple[LoopPage, Callable[[], object], Callable[[], object]]
+"""A page, a step without it and a step with it."""
 
 
 @dataclass
 class ViewCost:
-    """Time a document's loop, bare and shown."""
+    """Time a document's loop, bare and shown; or, of a task, the iterations of its learner."""
 
     document: tyro.conf.Positional[Path] = Path("examples/xhand1_palm.yaml")
+    learner: bool = False
+    """The document is a task: time `tgdsl train --view`."""
     num_envs: int = 64
+    device: str = "cpu"
+    """Device of a learner; a loop's is the CPU."""
     threads: int = 0
-    """CPU threads of physics; 0: one per CPU."""
+    """CPU threads of a loop's physics; 0: one per CPU."""
     seconds: float = 2.0
-    """Length of a block."""
+    """Length of a block, at least one step of the loop, or one iteration of the learner."""
     blocks: int = 9
     port: int = 8440
 
     def run(self) -> None:
         """Print the ratio of the times of a step, shown over bare: median and quartiles over pairs of blocks."""
+        with self._learner() if self.learner else self._loop() as (page, bare, shown):
+            browser = subprocess.Popen([sys.executable, __file__, "browser", page.url.rpartition(":")[2]])
+            self._block(bare)
+            time.sleep(1.0)
+            self._block(shown)
+            begin = page.num_frames
+            pairs = [(self._block(bare), self._block(shown)) for _ in range(self.blocks)]
+            browser.kill()
+            num_frames = page.num_frames - begin
+        ratios = np.array([[shown[i] / bare[i] for i in range(2)] for bare, shown in pairs])
+        shown_seconds = sum(shown[2] for _, shown in pairs)
+        print(f"{self.document}: {self.num_envs} environments, {self.device}, {len(os.sched_getaffinity(0))} CPUs, ", end="")
+        print(f"torch threads {torch.get_num_threads()}, {num_frames / shown_seconds:.1f} frames/s while shown")
+        for i, name in enumerate(("wall", "CPU of the loop")):
+            low, mid, high = np.quantile(ratios[:, i], (0.25, 0.5, 0.75))
+            step = 1e3 * np.median([bare[i] for bare, _ in pairs])
+            print(f"{name}: {step:.2f} ms per step, shown / bare {mid:.3f} ({low:.3f} to {high:.3f})")
+
+    @contextlib.contextmanager
+    def _loop(self) -> Iterator[Opened]:
         touch = tgdsl.compile(self.document)
         sim = tgdsl.simulate(touch, num_envs=self.num_envs, substeps=5, threads=self.threads)
         page = tgdsl.show(touch, sim, port=self.port)
@@ -49,30 +77,43 @@ class ViewCost:
             sim.step()
             page.update(touch(sim.state()))
 
-        browser = subprocess.Popen([sys.executable, __file__, "browser", page.url.rpartition(":")[2]])
-        self._block(bare)
-        time.sleep(1.0)
-        self._block(shown)
-        frames_before = page.num_frames
-        pairs = np.array([[self._block(bare), self._block(shown)] for _ in range(self.blocks)])
-        rate = (page.num_frames - frames_before) / (self.blocks * self.seconds)
-        browser.kill()
-        page.close()
-        cpus, torch_threads = len(os.sched_getaffinity(0)), torch.get_num_threads()
-        print(f"{self.document}: {self.num_envs} environments, {cpus} CPUs, physics threads {self.threads or cpus}, ", end="")
-        print(f"torch threads {torch_threads}, {rate:.1f} frames/s")
-        for i, name in enumerate(("wall", "CPU of the loop")):
-            low, mid, high = np.quantile(pairs[:, 1, i] / pairs[:, 0, i], (0.25, 0.5, 0.75))
-            step = 1e3 * np.median(pairs[:, 0, i])
-            print(f"{name}: {step:.2f} ms per step, shown / bare {mid:.3f} ({low:.3f} to {high:.3f})")
+        try:
+            yield page, bare, shown
+        finally:
+            page.close()
 
-    def _block(self, step: Callable[[], None]) -> tuple[float, float]:
-        """Return wall and CPU time of a step [s]."""
+    @contextlib.contextmanager
+    def _learner(self) -> Iterator[Opened]:
+        from tgdsl.commands.train import learner_page
+        from tgdsl.rl.env import TouchEnv
+        from tgdsl.rl.load import load_task
+        from tgdsl.rl.train.learner import Learner
+
+        loaded = load_task(self.document)
+        env = TouchEnv(loaded, self.num_envs, device=self.device)
+        learner = Learner(env, loaded, seed=0)
+        with learner_page(learner) as page:
+            send = learner.on_step
+
+            def bare() -> None:
+                learner.on_step = None
+                learner.iterate()
+
+            def shown() -> None:
+                learner.on_step = send
+                learner.iterate()
+
+            yield page, bare, shown
+        env.close()
+
+    def _block(self, step: Callable[[], object]) -> tuple[float, float, float]:
+        """Return wall and CPU time of a step, and the time of all [s]."""
         begin, cpu, count = time.perf_counter(), time.process_time(), 0
         while time.perf_counter() - begin < self.seconds:
             step()
             count += 1
-        return (time.perf_counter() - begin) / count, (time.process_time() - cpu) / count
+        seconds = time.perf_counter() - begin
+        return seconds / count, (time.process_time() - cpu) / count, seconds
 
 
 async def browse(port: int) -> None:

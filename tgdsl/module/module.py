@@ -10,7 +10,7 @@ import copy
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -82,7 +82,7 @@ class TactileModule(HookedModule):
         """The fields of a scene that the module reads, and their order."""
         return self.plan.inputs
 
-    @property
+    @cached_property
     def outputs(self) -> tuple[Output, ...]:
         """Name, shape, channels and units of each reading; a tuple that prints as a table."""
         return outputs_of(self.plan)
