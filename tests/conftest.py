@@ -35,6 +35,7 @@ def here(monkeypatch, capsys):
         monkeypatch.chdir(folder)
         monkeypatch.setattr(sys, "argv", ["tgdsl", *arguments])
         monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)  # the command sets its own
+        monkeypatch.setattr("tgdsl.console.progress.LINE_PERIOD", 1e6)  # no lines of progress on a busy machine
         capsys.readouterr()
         try:
             from tgdsl.commands.cli import main

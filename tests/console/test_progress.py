@@ -8,11 +8,14 @@ import struct
 import subprocess
 import sys
 import termios
+import time
 from pathlib import Path
 
 import pytest
 
 import tgdsl
+from tgdsl.console import progress as progress_module
+from tgdsl.console.bar import Bar
 from tgdsl.console.progress import StatusLine
 
 REPOSITORY = Path(__file__).parents[2]
@@ -96,16 +99,62 @@ class Terminal(io.StringIO):
 
 def test_a_status_line_is_drawn_over_itself_and_wiped(monkeypatch):
     monkeypatch.setenv("COLUMNS", "11")
-    screen, quiet = Terminal(), io.StringIO()
+    screen = Terminal()
     monkeypatch.setattr(sys, "stderr", screen)
     with StatusLine() as progress:
         progress("a first long line")
         progress("second")
     assert screen.getvalue() == "\r\x1b[Ka first lo\r\x1b[Ksecond\r\x1b[K"
-    monkeypatch.setattr(sys, "stderr", quiet)
-    with StatusLine() as progress:
+
+
+def test_short_work_prints_nothing_where_there_is_no_terminal():
+    stream = io.StringIO()
+    with StatusLine(stream) as progress:
         progress("first")
-    assert quiet.getvalue() == ""
+    assert stream.getvalue() == ""
+
+
+def wait_for(stream: io.StringIO, text: str) -> None:
+    end = time.monotonic() + 20
+    while text not in stream.getvalue() and time.monotonic() < end:
+        time.sleep(0.01)
+
+
+def test_a_long_job_is_printed_once_where_there_is_no_terminal():
+    """Also while it blocks the thread that reported it."""
+    stream = io.StringIO()
+    with StatusLine(stream, period=0.05) as progress:
+        progress("long")
+        wait_for(stream, "long")
+        time.sleep(0.2)
+        progress("other")
+        wait_for(stream, "other")
+    progress("again")
+    wait_for(stream, "again")
+    progress.wipe()
+    assert stream.getvalue() == "long\nother\nagain\n"
+
+
+def test_lines_are_at_least_a_period_apart():
+    stream, begin = io.StringIO(), time.monotonic()
+    with StatusLine(stream, period=0.1) as progress:
+        for i in range(50):
+            progress(str(i))
+            time.sleep(0.01)
+    assert 1 <= len(stream.getvalue().splitlines()) <= (time.monotonic() - begin) / 0.1
+
+
+def test_a_bar_counts_where_there_is_no_terminal(monkeypatch):
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setattr(progress_module, "LINE_PERIOD", 0.05)
+    with Bar("stepping", 7, "step") as bar:
+        bar.update()
+        bar.update(2)
+        wait_for(stream, "stepping")
+        bar.set_description_str("drawing")
+        wait_for(stream, "drawing")
+    assert stream.getvalue() == "stepping: 3 of 7 steps\ndrawing\n"
 
 
 @pytest.mark.slow

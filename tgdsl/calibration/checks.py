@@ -18,6 +18,7 @@ from jaxtyping import Float
 from scipy import stats
 
 from tgdsl.calibration.problem import Problem, Solution
+from tgdsl.console.progress import Progress
 
 HoldOut = Literal["none", "taxel", "blocks", "time", "recording"]
 Intervals = Literal["profile", "bootstrap", "none"]
@@ -105,10 +106,11 @@ def profile_interval(problem: Problem, solution: Solution, known: Uncertainty, j
     return end(-1.0), end(1.0)
 
 
-def bootstrap_intervals(problem: Problem, solution: Solution, seed: int) -> Float[np.ndarray, "unknown 2"]:
+def bootstrap_intervals(problem: Problem, solution: Solution, seed: int, progress: Progress) -> Float[np.ndarray, "unknown 2"]:
     """Return intervals of all parameters, in x, from fits to rows (of several samples of few rows: samples) drawn again."""
     rng, places = np.random.default_rng(seed), []
-    for _ in range(RESAMPLES):
+    for i in range(RESAMPLES):
+        progress(f"bootstrap: fit {i + 1} of {RESAMPLES}")
         weights = []
         for part in problem.parts:
             samples, rows, _ = part.target.value.shape
@@ -121,10 +123,11 @@ def bootstrap_intervals(problem: Problem, solution: Solution, seed: int) -> Floa
     return np.percentile(np.stack(places), [tail, 100 - tail], axis=0).T
 
 
-def held_out(problem: Problem, solution: Solution, by: HoldOut, folds: int, seed: int) -> list[float]:
+def held_out(problem: Problem, solution: Solution, by: HoldOut, folds: int, seed: int, progress: Progress) -> list[float]:
     """Return the relative RMSE of each part on numbers that were held out, each once."""
     predicted = [np.zeros_like(part.value) for part in problem.parts]
-    for masks in _masks(problem, by, folds, seed):
+    for i, masks in enumerate(_masks(problem, by, folds, seed)):
+        progress(f"fitting without held-out part {i + 1}")
         weights = [np.where(mask, 0.0, part.weight) for mask, part in zip(masks, problem.parts, strict=True)]
         fitted = problem.minimise(solution.x, weights, max_steps=20)
         if by == "recording":  # nuisances are its own, parameters the others'

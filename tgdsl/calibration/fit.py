@@ -23,6 +23,7 @@ from tgdsl.calibration.model import Model, Parameter
 from tgdsl.calibration.problem import Problem, ReadingMap, Solution
 from tgdsl.calibration.recordings import Arrays, load_recording
 from tgdsl.compiler.pipeline import Document
+from tgdsl.console.progress import Progress, silent
 from tgdsl.console.tables import text_table
 from tgdsl.errors import TgdslError
 from tgdsl.fields.models import SpecModel
@@ -119,6 +120,7 @@ def calibrate(
     seed: int = 0,
     overrides: Mapping[str, Any] | None = None,
     kinds: Sequence[Kind] = (),
+    progress: Progress = silent,
 ) -> Fit:
     """Fit parameters of sensors to recordings.
 
@@ -139,11 +141,13 @@ def calibrate(
         seed: Seed of starting points, folds and the bootstrap.
         overrides: Values by dotted path, as for `tgdsl.compile`.
         kinds: Your own kinds of sensors.
+        progress: Called with a line of text for each part of the work.
 
     Raises:
         SpecError: All mistakes in the document, or in a recording, by its keys.
         TgdslError: If a parameter does not exist or is no number, or there are fewer numbers than unknowns.
     """
+    progress("compiling")
     model = Model(document, fit, overrides, kinds)
     sources = [recordings] if isinstance(recordings, (str, Path, Mapping)) else list(recordings)
     outputs = {output.name: output for output in model.module.outputs}
@@ -152,17 +156,17 @@ def calibrate(
     problem = Problem(model, loaded, reading, gain)
     if hold_out in ("taxel", "blocks") and all(part.target.value.shape[1] == 1 for part in problem.parts):
         raise TgdslError(f"hold_out: {hold_out}: each target has one row; expected time or recording")
-    solution = _best(problem, starts, seed, robust)
-    out = None if hold_out == "none" else checks.held_out(problem, solution, hold_out, folds, seed)
+    solution = _best(problem, starts, seed, robust, progress)
+    out = None if hold_out == "none" else checks.held_out(problem, solution, hold_out, folds, seed, progress)
     known = checks.uncertainty(problem, solution)
-    fitted = _parameters(problem, solution, known, intervals, seed)
+    fitted = _parameters(problem, solution, known, intervals, seed, progress)
     errors = _errors(problem, solution, out)
     notes = _warnings(problem, solution, known, fitted, errors)
     model.set(problem.values(solution.x))
     return Fit({f.path: f for f in fitted}, _nuisances(problem, solution), errors, notes, problem, solution)
 
 
-def _best(problem: Problem, starts: int, seed: int, robust: bool) -> Solution:
+def _best(problem: Problem, starts: int, seed: int, robust: bool, progress: Progress) -> Solution:
     """Return the best of several minima, with the weights of rows and the noise of targets estimated."""
     problem.find_linear()
     places, num = [problem.start], problem.num_parameters - len(problem.linear)
@@ -171,11 +175,17 @@ def _best(problem: Problem, starts: int, seed: int, robust: bool) -> Solution:
         drawn = sobol.random(1 << (starts - 1).bit_length())[: starts - 1]
         places += [np.concatenate([0.02 + 0.96 * u, np.zeros(len(problem.nuisances))]) for u in drawn]
     weights = problem.weights()
+    progress(f"comparing {len(places)} starting points")
     ranked = sorted(places, key=lambda x: problem.solve(x, weights).cost)
     chosen = [places[0], *[x for x in ranked if x is not places[0]][: CONTINUED - 1]]
-    rough = [problem.minimise(x, max_steps=12) for x in chosen]
+    rough = []
+    for i, x in enumerate(chosen):
+        progress(f"fitting from starting point {i + 1} of {len(chosen)}")
+        rough.append(problem.minimise(x, max_steps=12))
+    progress("fitting from the best of them")
     solution = problem.minimise(min(rough, key=lambda each: each.cost).x)
-    for _ in range(ROUNDS):
+    for i in range(ROUNDS):
+        progress(f"estimating the noise, round {i + 1} of at most {ROUNDS}")
         before = problem.sigma.copy()
         problem.estimate(solution, HUBER if robust else None)
         if not robust and abs(problem.sigma / before - 1).max() < 0.02:
@@ -188,11 +198,12 @@ def _best(problem: Problem, starts: int, seed: int, robust: bool) -> Solution:
 
 
 def _parameters(
-    problem: Problem, solution: Solution, known: Uncertainty, intervals: Intervals, seed: int
+    problem: Problem, solution: Solution, known: Uncertainty, intervals: Intervals, seed: int, progress: Progress
 ) -> list[FittedParameter]:
-    ends = checks.bootstrap_intervals(problem, solution, seed) if intervals == "bootstrap" else None
+    ends = checks.bootstrap_intervals(problem, solution, seed, progress) if intervals == "bootstrap" else None
     result = []
     for j, parameter in enumerate(problem.model.parameters):
+        progress(f"interval of {parameter.path}")
         if intervals == "none":
             low, high = np.clip(solution.x[j] + np.array([-1.96, 1.96]) * known.sigma[j], 0.0, 1.0)
         else:
@@ -307,6 +318,7 @@ def compare(
     models: str | Path | Mapping[str, Mapping[str, Any]],
     *,
     overrides: Mapping[str, Any] | None = None,
+    progress: Progress = silent,
     **options: Any,
 ) -> Comparison:
     """Fit several kernels or kinds to the same recordings.
@@ -325,6 +337,7 @@ def compare(
         recordings: What to fit them to, as `tgdsl.calibrate` takes them.
         models: A YAML file with `compare:`, or what stands there as a mapping: by name `set` and `fit`.
         overrides: Values by dotted path, for all models.
+        progress: Called with a line of text for each part of the work.
         options: Other options of `tgdsl.calibrate`, for all models.
 
     Raises:
@@ -333,8 +346,10 @@ def compare(
     """
     source = {"tgdsl": 1, "compare": models} if isinstance(models, Mapping) else Path(models)
     spec, _ = read_spec(source, ComparisonSpec, ("tgdsl", "compare"))
-    fits = {
-        name: calibrate(document, recordings, each.fit, overrides={**(overrides or {}), **each.set}, **options)
-        for name, each in spec.compare.items()
-    }
+    fits = {}
+    for name, each in spec.compare.items():
+        progress(f"model {name}")
+        fits[name] = calibrate(
+            document, recordings, each.fit, overrides={**(overrides or {}), **each.set}, progress=progress, **options
+        )
     return Comparison(fits)

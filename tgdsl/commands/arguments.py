@@ -18,8 +18,7 @@ from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.files.write import atomic_write, check_writable
 
 if TYPE_CHECKING:
-    from tqdm import tqdm
-
+    from tgdsl.console.bar import Bar
     from tgdsl.module.module import TactileModule
     from tgdsl.rl.env import TouchEnv
     from tgdsl.rl.playing.policy import PolicyFile
@@ -169,11 +168,11 @@ def calibration_of(file: Path | None) -> Calibration | None:
     return None if file is None else load_calibration(file)
 
 
-def progress_bar(job: str, total: int | None = None, unit: str = "step") -> tqdm:
-    """Return a bar that counts on a terminal, and is wiped at the end."""
-    from tqdm import tqdm
+def progress_bar(job: str, total: int | None = None, unit: str = "step") -> Bar:
+    """Return a bar that counts on a terminal, and is wiped at the end; elsewhere a line every few seconds."""
+    from tgdsl.console.bar import Bar
 
-    return tqdm(total=total, desc=job, unit=unit, disable=None, leave=False)
+    return Bar(job, total, unit)
 
 
 def check_learning_device(device: str) -> None:

@@ -71,16 +71,14 @@ class CalibrateSensor:
             if self.fit or self.out is not None or self.plot is not None:
                 raise TgdslError("--compare prints a table of its own models, expected no --fit, --out or --plot")
             with StatusLine() as progress:
-                progress("fitting each model")
-                table = compare(self.document, list(self.recordings), self.compare, **options)
+                table = compare(self.document, list(self.recordings), self.compare, progress=progress, **options)
             print(table)
             return
         for file in (self.out, self.plot):
             if file is not None:
                 args.refuse_to_replace(file, self.force)
         with StatusLine() as progress:
-            progress("fitting")
-            fit = calibrate(self.document, list(self.recordings), self.fit, **options)
+            fit = calibrate(self.document, list(self.recordings), self.fit, progress=progress, **options)
         print(fit)
         if self.out is not None:
             print(f"document: {fit.document(self.out)}")

@@ -8,7 +8,7 @@ import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -17,9 +17,9 @@ from tgdsl.errors import TgdslError
 from tgdsl.files.write import check_writable
 
 if TYPE_CHECKING:
-    from tqdm import tqdm
+    from tgdsl.console.bar import Bar
 
-BAR: dict[str, Any] = {"total": 1, "disable": None, "leave": False, "bar_format": "{n_fmt}/{total_fmt} |{bar:20}| {desc}"}
+BAR_FORMAT = "{n_fmt}/{total_fmt} |{bar:20}| {desc}"
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,7 @@ class Bench:
             return
         if self.oracles or self.hard:
             raise TgdslError(f"bench {self.document}: --oracles and --hard need no document, expected one or the other")
-        from tqdm import tqdm
-
+        from tgdsl.console.bar import Bar
         from tgdsl.report.bench.bench import Bench as Work
         from tgdsl.report.bench.bench import Options, bench
         from tgdsl.report.bench.compare import compared, read_rows
@@ -90,15 +89,15 @@ class Bench:
             check_writable(self.save_states)
         run = {name: getattr(self, name) for name in ("sensors", "states", "save_states", "state_envs", "steps", "substeps")}
         work = Work(self.document, args.parsed_overrides(self.set), **run, options=options)
-        with tqdm(**BAR, desc="compiling") as bar:
-            report = bench(work, lambda what: bar.set_description_str(what), lambda done, of: _show(bar, done, of))
+        with Bar("compiling", 1, "variant", bar_format=BAR_FORMAT) as bar:
+            report = bench(work, bar.set_description_str, lambda done, of: _show(bar, done, of))
         print(bench_text(report))
         if earlier is not None:
             print("\n".join(["", f"against {self.against}", *compared(report, earlier).lines()]))
         print("\n".join(["", *map(str, write_bench(report, self.out))]))
 
 
-def _show(bar: tqdm, done: int, total: int) -> None:
+def _show(bar: Bar, done: int, total: int) -> None:
     bar.total, bar.n = total, done
     bar.refresh()
 
@@ -116,12 +115,12 @@ def _run_tests(names: list[str], out: Path) -> None:
 
 def _run_sheet(name: str, tests: ModuleType, out: Path) -> int:
     """Compute a report, print its table and write its files; return how many of its results are wrong."""
-    from tqdm import tqdm
+    from tgdsl.console.bar import Bar
 
-    with tqdm(**BAR, desc=name) as bar:
+    with Bar(name, 1, "section", bar_format=BAR_FORMAT) as bar:
 
         def begun(section: str, done: int, total: int) -> None:
-            bar.set_description_str(section, refresh=False)
+            bar.set_description_str(f"{name}: {section}", refresh=False)
             _show(bar, done, total)
 
         sheet = tests.sheet(name, begun)

@@ -1,14 +1,16 @@
-"""Notes on long work: whoever starts it hands in a function that is told what is being done."""
+"""Progress of long work: the caller passes a function that takes the name of each job."""
 
 from __future__ import annotations
 
 import shutil
 import sys
+import threading
 import time
 from collections.abc import Callable
 from types import TracebackType
 from typing import TextIO
 
+LINE_PERIOD = 5.0  # time between lines where there is no terminal [s]
 Progress = Callable[[str], None]  # called with what is done next, such as "object mug: distance grid"
 
 
@@ -17,12 +19,15 @@ def silent(what: str) -> None:
 
 
 class StatusLine:
-    """One line of a terminal that says what is being done and is wiped at the end; elsewhere nothing is printed."""
+    """The current job: on a terminal one line that is wiped at the end; elsewhere a line every few seconds."""
 
-    def __init__(self, stream: TextIO | None = None):
-        """Write to a stream; default: standard error."""
-        self._stream = stream or sys.stderr
+    def __init__(self, stream: TextIO | None = None, period: float | None = None):
+        """Write to a stream (default: standard error); where it is no terminal, at most once per period [s]."""
+        self._stream, self._period = stream or sys.stderr, LINE_PERIOD if period is None else period
         self._is_shown = self._stream.isatty()
+        self._what = ""
+        self._is_over = threading.Event()
+        self._printer: threading.Thread | None = None
 
     def __call__(self, what: str) -> None:
         """Show the current job instead of the last one."""
@@ -30,12 +35,31 @@ class StatusLine:
             width = shutil.get_terminal_size().columns - 1
             self._stream.write(f"\r\x1b[K{what[:width]}")
             self._stream.flush()
+            return
+        self._what = what
+        if self._printer is None:
+            self._printer = threading.Thread(target=self._print_lines, daemon=True)
+            self._printer.start()
+
+    def _print_lines(self) -> None:
+        """Print the current job once per period, if it is another one than before: a job may block its own thread for long."""
+        last = ""
+        while not self._is_over.wait(self._period):
+            if self._what != last:
+                last = self._what
+                self._stream.write(f"{last}\n")
+                self._stream.flush()
 
     def wipe(self) -> None:
         """Remove the line, so that something else can be printed."""
         if self._is_shown:
             self._stream.write("\r\x1b[K")
             self._stream.flush()
+        elif self._printer is not None:
+            self._is_over.set()
+            self._printer.join()
+            self._printer = None
+            self._is_over.clear()
 
     def __enter__(self) -> StatusLine:
         return self
