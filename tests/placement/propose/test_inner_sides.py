@@ -37,6 +37,49 @@ def test_the_inner_side_is_where_it_was_made(made):
     assert found == {name: hand.facing.get(name, INNER) for name in found}
 
 
+TURNS = [(0, 0, 25), (0, 25, 0), (0, 0, 45), (10, 20, 35)]
+TURNED_HANDS = ["five_fingers", "parallel_jaws", "spread_fingers"]
+
+
+def with_turned_frames(text: str, rotation: np.ndarray) -> mujoco.MjSpec:
+    """Return a hand whose links' frames are turned, while all its geoms and joints are where they were."""
+    spec = mujoco.MjSpec.from_string(text)
+    model = spec.compile()
+    turn, back, product = np.zeros(4), np.zeros(4), np.zeros(4)
+    mujoco.mju_mat2Quat(turn, rotation.ravel())
+    mujoco.mju_negQuat(back, turn)
+    for i in range(1, model.nbody):
+        body, is_first = spec.body(model.body(i).name), not model.body_parentid[i]
+        mujoco.mju_mulQuat(product, model.body_quat[i], turn)
+        if not is_first:
+            mujoco.mju_mulQuat(product, back, product.copy())
+        body.alt.type, body.quat = mujoco.mjtOrientation.mjORIENTATION_QUAT, product
+        body.pos = model.body_pos[i] if is_first else rotation.T @ model.body_pos[i]
+        for geom in body.geoms:  # their own frames are those of their links
+            geom.pos, geom.quat = rotation.T @ geom.pos, back
+        for joint in body.joints:
+            joint.pos, joint.axis = rotation.T @ joint.pos, rotation.T @ joint.axis
+    for equality in spec.equalities:
+        if equality.type == mujoco.mjtEq.mjEQ_CONNECT:
+            equality.data[:3] = rotation.T @ equality.data[:3]
+    return spec
+
+
+@pytest.mark.parametrize("name", TURNED_HANDS)
+@pytest.mark.parametrize("turn", TURNS)
+def test_inner_sides_do_not_hang_on_the_frames_of_links(tmp_path, name, turn):
+    """In hundredths, and within the 15 deg at which an axis stands for a side."""
+    quat, rotation = np.zeros(4), np.zeros(9)
+    mujoco.mju_euler2Quat(quat, np.radians(turn), "xyz")
+    mujoco.mju_quat2Mat(rotation, quat)
+    rotation, hand = rotation.reshape(3, 3), MADE[name]
+    proposal = propose(loaded(tmp_path, with_turned_frames(hand.text, rotation).to_xml()), DENSITY)
+    for link in proposal.links:
+        expected = np.array(hand.facing.get(link.name, INNER))
+        assert rotation @ link.facing @ expected > np.cos(np.radians(15.2)) * np.linalg.norm(link.facing), link.name
+    assert set(proposal.groups["tips"]) == hand.tips
+
+
 def test_what_is_before_or_beside_a_hand_is_left_out(made):
     hand, proposal = made
     assert {name for name, why in proposal.left_out if "--include" in why} == hand.left_out

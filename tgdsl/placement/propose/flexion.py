@@ -29,8 +29,12 @@ MIN_LEVER = 0.25
 """A link whose centre is nearer to its hinge than this share of the square root of its surface turns in place, unless it is a
 single jaw."""
 LINK_SNAP, PALM_SNAP = np.radians(30.1), np.radians(40.1)
-"""A direction this close to an axis of the link's frame is taken to be that axis; a palm's that is farther is not taken.
-No angles that people draw: the last bits of a pose shall not decide."""
+"""A direction this close to the normal of a flat side, or to an axis of the link's frame, is taken to be that; a palm's that is
+farther is not taken. No angles that people draw: the last bits of a pose shall not decide."""
+FLAT, ALIKE = 0.35, np.radians(3.1)
+"""Least share of the faces that look along a direction that a flat side has, and the largest angle between normals of one."""
+MAX_SIDES = 32  # faces that are tried as parts of it, from the largest on
+TURNED = np.radians(15.1)  # an axis this close to the normal of a flat side stands for it: the sides beside it are excluded
 STEP = 0.02  # share of its way by which a joint closes to see where a link goes
 MIN_COSINE = 0.5  # least cosine of the angle between directions to which fingers curl for these to say where the palm faces
 PARALLEL, BESIDE = 0.99, 0.25
@@ -94,7 +98,7 @@ class Flexion:
             return InnerSide(None, UNCLEAR)
         joint, along = side
         turned = self._frames(self.open).xmat[body].reshape(3, 3).T @ along
-        return InnerSide(_link_side(turned), self.closing.motions[joint].doubt)
+        return InnerSide(self._link_side(body, turned), self.closing.motions[joint].doubt)
 
     def _is_across(self, body: int, side: InnerSide) -> bool:
         """Return whether hinges of a link's own have a lever on it and none carries it to its inner side or away from it."""
@@ -208,7 +212,7 @@ class Flexion:
         if float(np.linalg.norm(along)) < 1e-9 or along @ apart[0] < 0.5 * np.linalg.norm(along) * np.linalg.norm(apart[0]):
             return None
         rotation = self._frames(self.shut).xmat[body].reshape(3, 3)
-        return _link_side(rotation.T @ along)
+        return self._link_side(body, rotation.T @ along)
 
     def _fixed_side(self, body: int) -> InnerSide:
         """Return where a fixed jaw faces: against the moving one, as that comes to it."""
@@ -219,13 +223,13 @@ class Flexion:
         in_tip = self._frames(self.open).xmat[tip].reshape(3, 3).T @ along
         data = self._frames(self.shut)
         facing = -data.xmat[body].reshape(3, 3).T @ data.xmat[tip].reshape(3, 3) @ in_tip
-        return InnerSide(_link_side(facing), self.closing.motions[joint].doubt)
+        return InnerSide(self._link_side(body, facing), self.closing.motions[joint].doubt)
 
     def palm_side(self, body: int) -> InnerSide:
         """Return where a palm's inner side faces, in the frame of it or of a body that is fixed to it."""
         turned = self._frames(self.open).xmat[body].reshape(3, 3).copy()
         curled = self._curl_direction()
-        if curled is not None and (direction := _axis_near(turned.T @ curled, PALM_SNAP)) is not None:
+        if curled is not None and (direction := self._snapped(body, turned.T @ curled, PALM_SNAP)) is not None:
             return InnerSide(direction)
         tips = [tip for tip in self.hand.tips if self._nearest(self.tree.segment[tip])]
         if self.hand.palm is None or not tips or 2 * len(tips) < len(self.hand.tips):
@@ -234,7 +238,7 @@ class Flexion:
         joints = [anchor(self.tree, chain[0]) for chain in self.hand.chains]
         for start in (self.tree.centre(self.hand.palm, self._frames(self.open)), np.mean(joints, axis=0)):
             half, nearly, whole = (self._toward(start, body, tips, share) for share in (0.5, 0.75, 1.0))
-            direction = _axis_near(nearly, PALM_SNAP)
+            direction = self._snapped(body, nearly, PALM_SNAP)
             # Fingers that curl around cross the palm's plane where no palm is modelled in their way: no side is clear then.
             if direction is not None and min(half @ direction, whole @ direction) > 0.5:
                 return InnerSide(direction)
@@ -258,6 +262,17 @@ class Flexion:
         most = max(alike, key=len, default=[])
         return np.mean(most, axis=0) if 2 * len(most) > len(self.hand.chains) else None
 
+    def _link_side(self, body: int, direction: Float[np.ndarray, " 3"]) -> tuple[float, ...]:
+        """Return the side of a link that a direction in its frame means; the direction itself if that is near to none."""
+        return self._snapped(body, direction, LINK_SNAP) or _in_hundredths(direction)
+
+    def _snapped(self, body: int, direction: Float[np.ndarray, " 3"], angle: float) -> tuple[float, ...] | None:
+        """Return the flat side, else the axis of a body's frame, within an angle [rad] of a direction; None if none is."""
+        side = _flat_side(self.tree.surface[body], direction / max(float(np.linalg.norm(direction)), 1e-9), angle)
+        if side is None:
+            return _axis_near(direction, angle)
+        return _axis_near(side, TURNED) or _in_hundredths(side)
+
     def _toward(self, start: Float[np.ndarray, " 3"], body: int, tips: list[int], share: float) -> Float[np.ndarray, " 3"]:
         data = self._frames(self.closing.pose(share))
         toward = np.mean([self.tree.centre(tip, data) for tip in tips], axis=0) - start
@@ -272,12 +287,23 @@ def _axis_near(direction: Float[np.ndarray, " 3"], angle: float) -> tuple[float,
     return tuple(float(np.sign(direction[axis])) if i == axis else 0.0 for i in range(3)) if is_near else None
 
 
-def _link_side(direction: Float[np.ndarray, " 3"]) -> tuple[float, ...]:
-    """Return the axis of the frame that is near a direction; if none is, its unit vector in hundredths."""
+def _flat_side(surface: Surface, direction: Float[np.ndarray, " 3"], angle: float) -> Float[np.ndarray, " 3"] | None:
+    """Return a normal of the largest flat side within an angle [rad] of a unit vector; None if none is large enough."""
+    along = surface.face_normals @ direction
+    near, least = along >= np.cos(angle), FLAT * surface.face_areas @ (along >= np.cos(np.radians(WITHIN_DEG)))
+    normals, areas = surface.face_normals[near], surface.face_areas[near]
+    for i in np.argsort(-areas, kind="stable")[:MAX_SIDES]:
+        is_alike = normals @ normals[i] >= np.cos(ALIKE)
+        if areas @ is_alike >= least:
+            return (areas * is_alike) @ normals
+    return None
+
+
+def _in_hundredths(direction: Float[np.ndarray, " 3"]) -> tuple[float, ...]:
     unit = direction / max(float(np.linalg.norm(direction)), 1e-9)
     # Halves of a hundredth are rounded up, and what is just below them too.
     rounded = np.sign(unit) * np.floor(100.0 * np.abs(unit) + 0.501) / 100.0
-    return _axis_near(direction, LINK_SNAP) or tuple((rounded + 0.0).tolist())
+    return tuple((rounded + 0.0).tolist())
 
 
 WITHIN_DEG = 75  # largest angle between a normal and the inner side of its link [deg]
@@ -339,7 +365,9 @@ class PalmFront:
         self.flexion, tree, hand = flexion, flexion.tree, flexion.hand
         assert hand.palm is not None
         facing = flexion.palm_side(hand.palm).facing
-        self.axes = None if facing is None else frame(tree.start.xmat[hand.palm].reshape(3, 3) @ facing)
+        self.axes = (
+            None if facing is None else frame(tree.start.xmat[hand.palm].reshape(3, 3) @ facing / np.linalg.norm(facing))
+        )
         if self.axes is not None:
             poses = (flexion.open, flexion.closing.pose(0.5), flexion.shut)
             swept = [tree.points(b, flexion.closing.poses.kinematics(pose)) for pose in poses for b in hand.fingers]

@@ -328,8 +328,8 @@ def _boxes(flexion: Flexion) -> dict[int, Box]:
         return result
     front = PalmFront(flexion)
     for body in flexion.hand.mounts:
-        if (limit := front.limit(body)) is not None:
-            facing = np.array(flexion.palm_side(body).facing)
+        facing, limit = np.array(flexion.palm_side(body).facing), front.limit(body)
+        if limit is not None and np.abs(facing).max() == 1.0:  # the box of a region stands along the axes
             low, high = map(list, _around(flexion.tree.surface[body]))
             axis = int(np.abs(facing).argmax())
             (high if facing[axis] > 0 else low)[axis] = round(float(facing[axis] * limit), 4)
