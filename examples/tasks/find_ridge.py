@@ -109,6 +109,7 @@ class FindRidge(Task[FindRidgeSpec]):
     Spec = FindRidgeSpec
     senses = ("link_contact",)
     score_unit = "found"
+    own_groups = ("command", "priv_ridge")
     hand_groups = ("command",)
 
     @reward_term(1.0, "1/s")

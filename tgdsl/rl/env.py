@@ -199,6 +199,9 @@ class TouchEnv:
         self._terms = tuple(self._rates(self.now, torch.zeros_like(self.sim.faults)))
         self._sums = self._return.new_zeros((len(self._terms), num_envs))
         self.groups = {name: value.shape[1] for name, value in obs.items()}
+        own = type(self.task).own_groups
+        if own is not None and (other := set(own) ^ set(self.task.observe(self.now))):
+            raise SimulationError(f"{type(self.task).__name__}: `own_groups` and `observe` differ in {listed(sorted(other))}")
         if is_cuda or is_compiled:  # compile kernels and, on a GPU, capture the step
             for _ in range(PREPARING_STEPS):
                 self.step(torch.zeros_like(self._action))

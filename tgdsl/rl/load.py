@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import sys
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from os import PathLike
@@ -80,6 +80,9 @@ def load_task(document: str | PathLike[str] | Mapping[str, Any], overrides: Mapp
     problems: list[Problem] = list(source.problems)
     spec = validate(source, (), task.Spec, problems, REQUIRED)
     terms = _terms(source, folder, task, spec, problems) if isinstance(spec, TaskSpec) else {}
+    if isinstance(spec, TaskSpec) and task.own_groups is not None:
+        added = [name for name, term in terms.items() if isinstance(term, ObservationTerm)]
+        problems += wrong_groups(source, spec, [*SHARED_GROUPS, *added, *task.own_groups])
     if problems or not isinstance(spec, TaskSpec):
         raise SpecError(problems)
     return LoadedTask(spec, task, source, folder, terms)
@@ -119,6 +122,25 @@ def _terms(source: Source, folder: Path, task: type[Task[Any]], spec: TaskSpec, 
                 reason = error.errors()[0]["msg"].removeprefix("Value error, ")
                 problems.append(source.problem(("terms", name), f"{term.of} would be {value:g}: {reason}"))
     return terms
+
+
+def wrong_groups(source: Source, spec: TaskSpec, groups: Collection[str], empty: Collection[str] = ()) -> list[Problem]:
+    """Return the groups of observations that learners name and that are not among `groups`, or are empty, located."""
+    train = spec.train
+    named = {
+        ("train", "actor"): train.actor,
+        ("train", "critic"): train.critic,
+        ("train", "rnd", "groups"): None if train.rnd == "off" else train.rnd.groups,
+        ("distill", "groups"): spec.distill.groups,
+    }
+    places = [((*place, i), name) for place, names in named.items() for i, name in enumerate(names or ())]
+    return [
+        source.problem(place, f'there is no group of observations "{name}"', did_you_mean(name, groups, "groups"))
+        if name not in groups
+        else source.problem(place, f'the group of observations "{name}" is empty')
+        for place, name in places
+        if name not in groups or name in empty
+    ]
 
 
 def number_owners(task: type[Task[Any]], spec: TaskSpec, terms: Mapping[str, Term]) -> dict[str, SpecModel]:

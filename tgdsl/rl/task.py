@@ -232,6 +232,8 @@ class Task(ABC, Generic[S]):
     wants_normal_force: ClassVar[bool] = False
     score_unit: ClassVar[str]  #: unit of its score
     is_less_better: ClassVar[bool] = False  #: whether its score is an error
+    #: names of the groups of `observe`, so that loading a document finds wrong ones; None: they are known in environments alone
+    own_groups: ClassVar[tuple[str, ...] | None] = None
     #: groups that `observe_hand` computes without a scene: a policy on a hand sees no others of the task
     hand_groups: ClassVar[tuple[str, ...]] = ()
     #: keys of its document that are read once, when it is made: no curriculum can change them
@@ -248,6 +250,8 @@ class Task(ABC, Generic[S]):
     def __init_subclass__(cls, **options: Any) -> None:
         """Collect the terms of the reward; add `rewards`, their weights, and their parameters to the document's model."""
         super().__init_subclass__(**options)
+        if "own_groups" not in vars(cls) and vars(cls).keys() & {"__init__", "observe"}:
+            cls.own_groups = None
         terms_of_class = {value.name or name: value for name, value in vars(cls).items() if isinstance(value, TaskReward)}
         is_first = not any(hasattr(base, "Spec") for base in cls.__bases__)  # of a base without a document terms stand last
         cls.terms = {**(terms_of_class if is_first else {}), **cls.terms, **terms_of_class}

@@ -336,7 +336,7 @@ def test_a_teacher_may_feel(make, tmp_path):
 def test_mistakes_of_the_document_are_named(make):
     with pytest.raises(SpecError, match=r'distill\.decoders\.size: the task has no privileged number "size"'):
         make(decoders="{size: {}}")
-    said = 'there is no group of observations "propio" beside what each student feels; did you mean "proprio"?'
+    said = 'there is no group of observations "propio"; did you mean "proprio"?'
     with pytest.raises(SpecError, match=r"distill\.groups\[0\]: " + re.escape(said)):
         make(groups="[propio]")
     with pytest.raises(SpecError, match="steps is 5, expected a multiple of gradient_length, 2"):

@@ -4,7 +4,7 @@ import pytest
 from small_runs import small_learner
 from small_tasks import TASK, small_task
 
-from tgdsl.errors import SpecError
+from tgdsl.errors import SimulationError, SpecError
 from tgdsl.rl.load import load_task
 from tgdsl.rl.train.learner import config, observed
 
@@ -82,18 +82,28 @@ def test_mistakes_are_located(tmp_path, train, message):
 
 
 def test_groups_that_are_not_there_are_located(tmp_path):
+    wrong = "train: {actor: [gaol, propio], critic: [goals], rnd: {groups: [goa]}}\ndistill: {groups: [propio]}\n"
     with pytest.raises(SpecError) as raised:
-        observed(loaded(tmp_path, "train: {actor: [gaol, propio], critic: [goals], rnd: {groups: [goa]}}\n"), GROUPS)
-    places = ["train.actor[0]", "train.actor[1]", "train.critic[0]", "train.rnd.groups[0]"]
+        loaded(tmp_path, wrong)
+    places = ["train.actor[0]", "train.actor[1]", "train.critic[0]", "train.rnd.groups[0]", "distill.groups[0]"]
     assert [problem.path for problem in raised.value.problems] == places
     with pytest.raises(
         SpecError, match=r'task\.yaml:\d+:\d+: train\.critic\[1\]: there is no group of observations "gaol".*"goal"'
     ):
-        observed(loaded(tmp_path, "train: {critic: [proprio, gaol]}\n"), GROUPS)
+        loaded(tmp_path, "train: {critic: [proprio, gaol]}\n")
     with pytest.raises(SpecError, match=r'train\.actor\[0\]: there is no group of observations "tactile_sensors"'):
         small_learner(tmp_path, touch="none", train__actor="[tactile_sensors]")
+    own = "from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\nclass Own(InPalmRotate):\n    def observe(self, now):\n"
+    (tmp_path / "own.py").write_text(f"{own}        return {{}}\n")  # its groups are known in environments alone
+    task = loaded(tmp_path, "train: {rnd: {groups: [empty]}, actor: [gaol]}\n", task="own.py:Own")
+    with pytest.raises(SpecError, match=r'train\.actor\[0\]: there is no group of observations "gaol"'):
+        observed(task, GROUPS | {"empty": 0})
+    task = loaded(tmp_path, "train: {rnd: {groups: [empty]}}\n", task="own.py:Own")
     with pytest.raises(SpecError, match=r'train\.rnd\.groups\[0\]: the group of observations "empty" is empty'):
-        observed(loaded(tmp_path, "train: {rnd: {groups: [empty]}}\n"), GROUPS | {"empty": 0})
+        observed(task, GROUPS | {"empty": 0})
+    (tmp_path / "own2.py").write_text(f"{own}        return super().observe(now)\n    own_groups = ('goal', 'command')\n")
+    with pytest.raises(SimulationError, match="`own_groups` and `observe` differ in command, priv_obj_props, priv_obj_state"):
+        small_learner(tmp_path, task="own2.py:Own")
 
 
 @pytest.mark.parametrize(

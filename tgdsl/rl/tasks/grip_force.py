@@ -89,6 +89,7 @@ class GripForce(terms.HandTask[GripForceSpec]):
     senses = ("link_contact", "surface_distance")
     wants_normal_force = True
     score_unit = "RMS of force error over command"
+    own_groups = ("goal", "priv_force", "priv_obj_state", "priv_obj_props")
     is_less_better = True
     constants = ("settling",)
     hand_groups = ("goal",)

@@ -88,6 +88,7 @@ class HotBall(terms.HandTask[HotBallSpec]):
     Spec = HotBallSpec
     senses = ("temperature_grid", "link_contact", "surface_distance")
     score_unit = "s of latched contact"
+    own_groups = ("priv_heat", "priv_obj_state", "priv_obj_props")
 
     @reward_term(1.0, "1/s")
     def approach(self, now: Now) -> Float[Tensor, " env"]:

@@ -106,6 +106,7 @@ class InHandRepose(terms.HandTask[InHandReposeSpec]):
     senses = ("link_contact", "surface_distance")
     constants = ("goal_step",)
     score_unit = "goals in a row"
+    own_groups = ("goal", "priv_obj_state", "priv_obj_props")
 
     @reward_term(500.0, "1/s")
     def success(self, now: Now) -> Bool[Tensor, " env"]:

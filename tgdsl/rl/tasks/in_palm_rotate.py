@@ -80,6 +80,7 @@ class InPalmRotate(terms.HandTask[InPalmRotateSpec]):
     Spec = InPalmRotateSpec
     senses = ("link_contact", "surface_distance")
     score_unit = "quarter turns"
+    own_groups = ("goal", "priv_obj_state", "priv_obj_props")
 
     @reward_term(150.0, "1/s")
     def success(self, now: Now) -> Float[Tensor, " env"]:

@@ -122,6 +122,7 @@ class Screwdriver(terms.HandTask[ScrewdriverSpec]):
     senses = ("link_contact", "surface_distance")
     constants = ("grasps", "stall")
     score_unit = "rad/s"
+    own_groups = ("priv_obj_state", "priv_obj_props")
 
     @reward_term(10.0, "1/rad")
     def spin(self, now: Now) -> Float[Tensor, " env"]:

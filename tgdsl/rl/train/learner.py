@@ -13,7 +13,7 @@ import io
 import math
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -24,10 +24,10 @@ from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
 from torch import Tensor
 
-from tgdsl.errors import Problem, SpecError, did_you_mean
+from tgdsl.errors import SpecError
 from tgdsl.rl.adapters.rsl_rl import TouchVecEnv
 from tgdsl.rl.env import Step, TouchEnv
-from tgdsl.rl.load import LoadedTask
+from tgdsl.rl.load import LoadedTask, wrong_groups
 from tgdsl.rl.playing.policy import card_texts, write_onnx_policy, write_policy
 from tgdsl.rl.playing.rollout import Actor, Moment, rollout
 from tgdsl.rl.sensed import GROUP
@@ -228,21 +228,11 @@ PPO_OPTIONS = {
 
 def observed(loaded: LoadedTask, groups: Mapping[str, int]) -> dict[str, list[str]]:
     """Return the groups of observations of actor, critic and, if there is one, random network distillation."""
-    train, problems = loaded.spec.train, list[Problem]()
-    privileged = [name for name in groups if name not in (PROPRIO, GROUP)]
-    named: dict[tuple[str, ...], Sequence[str] | None] = {("actor",): train.actor, ("critic",): train.critic}
-    if train.rnd != "off":
-        named["rnd", "groups"] = train.rnd.groups
-    for place, names in named.items():
-        for i, name in enumerate(names or ()):
-            if name not in groups:
-                problem, hint = f'there is no group of observations "{name}"', did_you_mean(name, groups, "groups")
-                problems.append(loaded.source.problem(("train", *place, i), problem, hint))
-            elif groups[name] == 0:
-                problem = f'the group of observations "{name}" is empty'
-                problems.append(loaded.source.problem(("train", *place, i), problem))
-    if problems:
+    train = loaded.spec.train
+    empty = [name for name, size in groups.items() if size == 0]
+    if problems := wrong_groups(loaded.source, loaded.spec, groups, empty):
         raise SpecError(problems)
+    privileged = [name for name in groups if name not in (PROPRIO, GROUP)]
     actor = list(train.actor or [name for name in privileged if name != PROPS])
     result = {"actor": actor, "critic": list(train.critic or privileged)}
     if train.rnd != "off":
