@@ -68,6 +68,11 @@ def test_modules_and_tables(three):
         tgdsl.check_taxels(touch, {"tuch": touch.taxels["touch"]})
 
 
+def test_columns_are_taken_by_torch(tmp_path):
+    normals = compiled(tmp_path).taxels["touch"]["normal"]
+    assert torch.equal(torch.tensor(normals), torch.tensor([[0.0, 0.0, 1.0]] * 3, dtype=torch.float64))
+
+
 def test_ids_tell_other_taxels_apart_but_no_rounding(three):
     touch, same, other = three
     tgdsl.check_taxels(touch, touch.taxels_id)

@@ -190,7 +190,8 @@ def _rollout_tables(path: Path) -> dict[str, dict[str, np.ndarray]]:
 
 
 def _structured(columns: Mapping[str, np.ndarray], size: int) -> TaxelTable:
-    table = np.empty(size, dtype=[(name, column.dtype, column.shape[1:]) for name, column in columns.items()])
+    fields = [(name, column.dtype, column.shape[1:]) for name, column in columns.items()]
+    table = np.empty(size, dtype=np.dtype(fields, align=True))  # torch takes a column without a copy
     for name, column in columns.items():
         table[name] = column
     return table.view(TaxelTable)

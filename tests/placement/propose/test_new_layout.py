@@ -42,6 +42,26 @@ def test_without_groups(tmp_path, here):
     assert "groups:" not in (tmp_path / "layout.yaml").read_text()
 
 
+def test_the_geoms_of_a_link_are_named(tmp_path, here):
+    """A link of several geoms lists them; a layout may name one of them in its place."""
+    body = """<body name="{0}" pos="{1} 0 -.02"><joint type="slide" axis="{2} 0 0" range="0 .02"/>
+        <geom name="{0}_arm" type="box" size=".004 .01 .02"/><geom name="{0}_pad" type="box" size=".004 .01 .01" pos="0 0 -.03"/></body>"""
+    fingers = body.format("left", -0.03, 1) + body.format("right", 0.03, -1)
+    (tmp_path / "hand.xml").write_text(
+        f'<mujoco><worldbody><body name="base"><geom type="box" size=".05 .02 .01"/>{fingers}</body></worldbody></mujoco>'
+    )
+    assert here(tmp_path, "layout", "new", "hand.xml")[0] == 0
+    file = tmp_path / "layout.yaml"
+    comments = [line.strip() for line in file.read_text().splitlines() if "one geom" in line]
+    names = ("left_arm, left_pad", "right_arm, right_pad")
+    assert comments == [f"# for taxels on one geom, write its name instead: {geoms}" for geoms in names]
+    file.write_text(file.read_text().replace("    left:", "    left_pad:"))
+    taxels = compiled(tmp_path, {"tips": "geometric"}).taxels["tips"]
+    assert set(taxels["link"]) == {"left_pad", "right"}
+    assert taxels["pos"][taxels["link"] == "left_pad"][:, 2].max() < -0.02  # the pad's upper end [m]
+    assert taxels["pos"][taxels["link"] == "right"][:, 2].max() > 0  # the arm has taxels too
+
+
 def test_a_file_is_not_overwritten(tmp_path, here):
     (tmp_path / "hand.xml").write_text(FOUR_BAR)
     (tmp_path / "layout.yaml").write_text("mine")

@@ -59,6 +59,7 @@ class LinkProposal:
     options: Options  # options by which taxels are where they can feel
     within: float = WITHIN_DEG  # largest angle between a normal and `facing` [deg]
     is_guess: bool = True  # whether side and box are guessed, not chosen
+    geoms: tuple[str, ...] = ()  # names of its geoms, if they are several: each could be a link
 
     @property
     def region(self) -> tuple[Any, ...]:
@@ -217,7 +218,9 @@ class Draft:
         return _measured(replace(result, doubt="", is_guess=False), self._surface(link.name, density))
 
     def _guess(self, name: str, density: float) -> LinkProposal:
-        return _link(name, self._surface(name, density), self._sides[name], self._boxes.get(name), density)
+        link = _link(name, self._surface(name, density), self._sides[name], self._boxes.get(name), density)
+        geoms = [geom.names for geom in self.robot.touchable(name)]
+        return replace(link, geoms=tuple(names[0] for names in geoms if names)) if len(geoms) > 1 else link
 
     def _surface(self, name: str, density: float) -> LinkSurface:
         """Return samples of a link for a density."""

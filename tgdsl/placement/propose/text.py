@@ -164,6 +164,8 @@ def _link_text(proposal: Proposal, link: LinkProposal, resolution: str) -> str:
     elif link.is_guess:
         about += f", {link.doubt}: all around"
     notes = [f"    # {about}\n"]
+    if link.geoms:
+        notes.append(f"    # for taxels on one geom, write its name instead: {listed([quoted(name) for name in link.geoms])}\n")
     notes += [f"    # {_OPTIONS[option]}\n" for option in link.options]
     return "".join(notes) + text
 
