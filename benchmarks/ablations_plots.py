@@ -12,12 +12,12 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from tgdsl.rl.spec import SENSED
+from tgdsl.rl.spec import touch_types
 from tgdsl.rl.students.keys import NONE
 
 MOST_LINES, MOST_COLUMNS = 10, 3
 """Lines of students in a panel, and panels side by side."""
-COLOURS = {name: colormaps["tab10"](i % 10) for i, name in enumerate(SENSED)} | {NONE: "black"}
+COLOURS = {name: colormaps["tab10"](i % 10) for i, name in enumerate(touch_types())} | {NONE: "black"}
 """Colour of each type, the same in all plots."""
 
 

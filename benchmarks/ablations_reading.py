@@ -34,9 +34,10 @@ from jaxtyping import Float, Int
 
 from tgdsl.errors import TgdslError
 from tgdsl.files.write import atomic_write, with_folder
+from tgdsl.observations.observations import PerLink
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
-from tgdsl.rl.sensed import PER_LINK, Felt, num_variants, types_of
+from tgdsl.rl.sensed import Felt, num_variants, types_of
 from tgdsl.rl.students.keys import NONE, Teacher
 
 FORCE = "priv_force"
@@ -132,7 +133,7 @@ def record(
             raise TgdslError(
                 f'the task "{loaded.spec.task}" has no group "{FORCE}", expected one that tells the force on its object'
             )
-        channels = {type_: _channels(env, type_, felt[type_]) for type_ in types} | {NONE: env.groups[BLIND] // env.num_actions}
+        channels = {type_: _channels(env, felt[type_]) for type_ in types} | {NONE: env.groups[BLIND] // env.num_actions}
         actor, obs, kept = own.bound(env), env.reset(seed), []
         least = 0.5 * loaded.spec.force[0]  # pyright: ignore[reportAttributeAccessIssue]
         number, first = torch.zeros(envs, dtype=torch.int64), round(SETTLING / env.control_step)
@@ -220,10 +221,10 @@ def _told(sums: Array) -> tuple[Array, Array, Array]:
     return 1.0 - errors / (squares - total**2 / count), np.sqrt(errors / count), np.sqrt(relative / count)
 
 
-def _channels(env: TouchEnv, type_: str, group: str) -> int:
+def _channels(env: TouchEnv, group: str) -> int:
     """Return how many numbers a type has of each taxel, or of each link."""
-    layout = env.felt[group].layout
-    return env.groups[group] // (len(layout.links) if type_ in PER_LINK else layout.num_taxels)
+    source = env.felt[group]
+    return env.groups[group] // (len(source.layout.links) if isinstance(source.spec, PerLink) else source.layout.num_taxels)
 
 
 def _folded(x: Array, y: Array, episode: Array, ridge: float, channels: int) -> float:

@@ -25,7 +25,7 @@ def wrong(thing: object) -> str:
 
 
 def known(group: str, own=(), given=()) -> list[str]:
-    return [thing.name for thing in plugins.known(group, "thing", "things", own, given, wrong)]
+    return [thing.name for thing in plugins.Registry(group, "thing", "things", own, wrong).known(given)]
 
 
 @pytest.fixture
@@ -65,7 +65,7 @@ def test_what_is_no_thing_is_left_out_with_a_warning_and_refused_where_it_is_giv
     first, second = (str(warning.message) for warning in caught)
     assert first == f'the thing "p0" of an unknown package ({__name__}:NUMBER) is left out: 3 is no thing'
     assert second == f"the thing \"p2\" of an unknown package ({__name__}:missing) is left out: KeyError: 'missing'"
-    assert "known(group)" in linecache.getline(caught[0].filename, caught[0].lineno)
+    assert ".known(given)" in linecache.getline(caught[0].filename, caught[0].lineno)
     with pytest.raises(TgdslError, match=r"^`things`: 3 is no thing$"):
         known("none", given=[NUMBER])
 

@@ -172,7 +172,7 @@ class DeepestObservation(PerLink):
 
 @pytest.fixture
 def deepest(monkeypatch):
-    monkeypatch.setattr(observations, "TYPES", dict(observations.TYPES))
+    monkeypatch.setattr(observations.TYPES, "registered", ())
     register(DeepestObservation)
 
 
@@ -194,7 +194,7 @@ def test_a_name_is_given_once(deepest):
     class Other(OfReading):
         type: Literal["deepest"]
 
-    with pytest.raises(TgdslError, match='two observation types are called "deepest"; rename one'):
+    with pytest.raises(TgdslError, match='two observation types are called "deepest": one of `register`, one of `register`'):
         register(Other)
     with pytest.raises(TgdslError, match='OfReading has no field `type: Literal\\["its_name"\\]`'):
         register(OfReading)

@@ -3,6 +3,7 @@
 import json
 import sys
 from pathlib import Path
+from typing import Literal
 
 import jsonschema
 import pytest
@@ -11,6 +12,7 @@ from ruamel.yaml import YAML
 from tiny_tasks import tiny_env, write_task
 
 from tgdsl.errors import SimulationError, SpecError
+from tgdsl.observations.observations import TYPES, PerLink
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task, task_schema
 from tgdsl.rl.playing.evaluation import evaluate
@@ -312,3 +314,27 @@ def test_a_task_without_sensors_is_evaluated(tmp_path):
     assert env.reset()["proprio"].shape[0] == 2 and "tactile_sensors" not in env.groups
     found = evaluate(env, ZeroActor(env), 2)
     assert found.gait.coasting is None and found.gait.link_forces == {} and found.gait.max_speed > 0
+
+
+class DeepestObservation(PerLink):
+    type: Literal["deepest"]
+    needs = ("depth",)
+    task_kind = "contact_depth"
+
+    @property
+    def features(self):
+        return (("largest depth", "m", "", 1.0),)
+
+    @staticmethod
+    def observe(reading, channels, constants):
+        return (reading[:, :, channels[0], None] * constants["operator"]).amax(dim=1)
+
+
+def test_a_registered_observation_is_a_word_of_touch(tmp_path, monkeypatch):
+    with pytest.raises(SpecError, match='touch: unknown type "deepest"; did you mean "depth"'):
+        load_task(write_task(tmp_path, more="touch: deepest\n"))
+    monkeypatch.setattr(TYPES, "registered", (DeepestObservation,))
+    env = tiny_env(tmp_path, 2, more="touch: deepest\n")
+    names = [feature.name for _, feature in env.describe()["tactile_sensors"]]
+    assert names == ["largest depth"] * env.groups["tactile_sensors"]
+    assert "deepest" in task_schema()["$defs"]["TaskSpec"]["properties"]["touch"]["enum"]

@@ -1,4 +1,4 @@
-"""What installed packages bring by entry points: kinds, quantities, sources; each by package and name."""
+"""Registries of what users and installed packages may add: kinds, quantities, noise stages, observations, terms, sources."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import warnings
 from collections.abc import Callable, Sequence
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, TypeVar
+from itertools import chain
+from operator import attrgetter
+from typing import Any, Generic, TypeVar
 
 from tgdsl.errors import TgdslError
 
@@ -14,27 +16,67 @@ Thing = TypeVar("Thing")
 Wrong = Callable[[object], str]  # returns why something is no such thing, or nothing
 
 
-def known(
-    group: str, what: str, argument: str, own: Sequence[Thing], given: Sequence[Thing], wrong: Wrong
-) -> tuple[Thing, ...]:
-    """Return all things of a sort: those of tgdsl (`own`), of installed packages, and the caller's (`given`).
+class Registry(Generic[Thing]):
+    """Things of one sort: those of tgdsl, of installed packages by package and name, and registered ones.
 
-    An installed one that cannot be had is left out, with a warning, the first time. An installed package may bring some of
-    those given, too. `what` is what one is called, "kind", and `argument` that by which a caller gives some, "kinds".
-
-    Raises:
-        TgdslError: If two have one name, or one that is given is none: `wrong` says what.
+    Args:
+        group: Group of the entry points by which packages bring them.
+        what: What messages call one, "sensor kind".
+        plural: What messages call several, and the argument by which a caller gives some, "kinds".
+        own: Those of tgdsl.
+        wrong: Returns why something is no such thing, or nothing.
+        name_of: Returns the name of one.
     """
-    result: dict[str, tuple[Any, str]] = {}
-    of_tgdsl = [(thing, "tgdsl") for thing in own]
-    for thing, whence in (*of_tgdsl, *installed(group, what, wrong), *((thing, f"`{argument}`") for thing in given)):
-        if reason := wrong(thing):
-            raise TgdslError(f"{whence}: {reason}")
-        other, first = result.setdefault(thing.name, (thing, whence))  # type: ignore[attr-defined]
-        if other is not thing:
-            name = thing.name  # type: ignore[attr-defined]
-            raise TgdslError(f'two {argument} are called "{name}": one of {first}, one of {whence}; rename or remove one')
-    return tuple(thing for thing, _ in result.values())
+
+    def __init__(
+        self,
+        group: str,
+        what: str,
+        plural: str,
+        own: Sequence[Thing],
+        wrong: Wrong,
+        name_of: Callable[[Any], str] = attrgetter("name"),
+    ):
+        self.group, self.what, self.plural = group, what, plural
+        self._own, self._wrong, self._name_of = tuple(own), wrong, name_of
+        self.registered: tuple[Thing, ...] = ()
+
+    def register(self, thing: Thing) -> None:
+        """Make a thing known to all documents and artefacts that are read from now on.
+
+        Raises:
+            TgdslError: If it is none, or another one has its name.
+        """
+        before, self.registered = self.registered, (*self.registered, thing)
+        try:
+            self.by_name()
+        except TgdslError:
+            self.registered = before
+            raise
+
+    def known(self, given: Sequence[Thing] = ()) -> tuple[Thing, ...]:
+        """Return all things: of tgdsl, of installed packages, registered and given ones.
+
+        An installed one that cannot be imported is left out, with a warning the first time. A thing may come in several ways.
+
+        Raises:
+            TgdslError: If two have one name, or one that is given is none.
+        """
+        return tuple(self.by_name(given).values())
+
+    def by_name(self, given: Sequence[Thing] = ()) -> dict[str, Thing]:
+        """Return what `known` does, by name."""
+        result: dict[str, tuple[Any, str]] = {}
+        sources = [((thing, "tgdsl") for thing in self._own), installed(self.group, self.what, self._wrong)]
+        sources += [((thing, "`register`") for thing in self.registered), ((thing, f"`{self.plural}`") for thing in given)]
+        for thing, source in chain.from_iterable(sources):
+            if reason := self._wrong(thing):
+                raise TgdslError(f"{source}: {reason}")
+            other, first = result.setdefault(name := self._name_of(thing), (thing, source))
+            if other is not thing:
+                problem = f'two {self.plural} are called "{name}": one of {first}, one of {source}'
+                raise TgdslError(f"{problem}; rename or remove one")
+        return {name: thing for name, (thing, _) in result.items()}
 
 
 @cache

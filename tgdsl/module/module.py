@@ -29,7 +29,7 @@ from tgdsl.module.outputs import ObservationTerm, Output, observation_terms, obs
 from tgdsl.module.sensing import Sensing, bind, constant_arrays, in_order, sense
 from tgdsl.module.state import Incoming, SceneState, example_state
 from tgdsl.module.taxels import SavedTaxels, images_of, row_tables, taxel_table
-from tgdsl.observations.observations import known_types
+from tgdsl.observations.observations import types_of
 from tgdsl.plan.inputs import Inputs
 from tgdsl.plan.plan import Plan
 from tgdsl.sensors import KINDS, Kind
@@ -63,7 +63,7 @@ class TactileModule(HookedModule):
         self.saved_taxels = SavedTaxels(plan)
         self._kinds = kinds_by_sensor(kinds, {sensor.name: sensor.kind for sensor in plan.sensors})
         self._quantities = tuple(quantity for quantity in quantities_of(kinds) if quantity.name in plan.quantities)
-        known_types([term.type for term in plan.observations])
+        self._observed = types_of([term.type for term in plan.observations])
         self._stages = {sensor.name: stages_of(sensor.noise.terms if sensor.noise else ()) for sensor in plan.sensors}
         self.constants = Constants(constant_arrays(plan), dtype, partial(bind, plan, self._kinds))
         self.memory = Memory(plan.sensors, plan.readings(), self._kinds)
@@ -258,7 +258,7 @@ class TactileModule(HookedModule):
         state = replace(touch.example_state(EXAMPLE_ENVS, dtype=dtype_of(state_dtype or self.dtype)), dt=dt)
         tensors = touch.incoming.tensors(state, touch.dtype, touch.device)
         memory = touch.initial_memory(EXAMPLE_ENVS, dt)
-        observed = partial(observe, touch.plan, touch.constants)
+        observed = partial(observe, touch.plan, touch.constants, types=touch._observed)
         step = Step(touch.plan, touch.constants, touch.pure_step, observed, tensors, memory, dt)
         return export_step(step, file, file_format, touch.inductor_options(), source, overrides)
 
@@ -326,7 +326,7 @@ class TactileModule(HookedModule):
             ObservationError: If an observed reading is missing or has another shape, or only the real hand has it.
         """
         self.constants.refresh()
-        return observe(self.plan, self.constants, readings)
+        return observe(self.plan, self.constants, readings, self._observed)
 
     def images(
         self, name: str, readings: Mapping[str, Tensor]

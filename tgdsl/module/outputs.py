@@ -15,7 +15,7 @@ from torch import Tensor
 
 from tgdsl.console.tables import Observations, Outputs
 from tgdsl.errors import ObservationError, did_you_mean
-from tgdsl.observations import observations
+from tgdsl.observations.observations import HAND_ONLY, Observation, hand_only_error
 from tgdsl.plan.plan import Plan
 from tgdsl.tensors.buffers import Constants
 
@@ -81,7 +81,9 @@ def observation_terms(plan: Plan) -> dict[str, tuple[ObservationTerm, ...]]:
     return Observations({group: tuple(terms) for group, terms in groups.items()})
 
 
-def observe(plan: Plan, constants: Constants, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
+def observe(
+    plan: Plan, constants: Constants, readings: Mapping[str, Tensor], types: Mapping[str, type[Observation]]
+) -> dict[str, Float[Tensor, "env feature"]]:
     """Return the observation groups of a plan, each the concatenation of its terms, every term flattened channel-major.
 
     Raises:
@@ -100,7 +102,7 @@ def observe(plan: Plan, constants: Constants, readings: Mapping[str, Tensor]) ->
             folded = constants.tree["observations"][term.key]
             reading = readings[term.reading]
             steps = reading.unbind(1) if reading.ndim == 4 else [reading]  # stacked calls: the oldest one's features first
-            features = [observations.TYPES[term.type].observe(step, term.channels, folded) for step in steps]
+            features = [types[term.type].observe(step, term.channels, folded) for step in steps]
         groups.setdefault(term.group, []).extend(features)
     return {group: torch.cat(parts, dim=1) for group, parts in groups.items()}
 
@@ -109,8 +111,8 @@ def _checked(plan: Plan, readings: Mapping[str, Tensor]) -> int:
     """Validate the readings that are observed, and return of how many environments they are."""
     planned = plan.readings()
     for term in plan.observations:
-        if term.type in observations.HAND_ONLY:
-            raise observations.hand_only_error(term.group, term.index, term.type)
+        if term.type in HAND_ONLY:
+            raise hand_only_error(term.group, term.index, term.type)
         if term.reading is None:
             continue
         where = f"observation {term.group}[{term.index}] ({term.type})"

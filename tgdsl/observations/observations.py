@@ -25,7 +25,7 @@ from torch import Tensor
 
 from tgdsl.errors import ObservationError, TgdslError
 from tgdsl.fields.models import Positive, Quantity, SpecModel
-from tgdsl.files.plugins import installed
+from tgdsl.files.plugins import Registry
 from tgdsl.layout.layout import Layout
 
 _FORCE, _TORQUE = (tuple(f"{name}_{axis}" for axis in "xyz") for name in ("force", "torque"))
@@ -361,23 +361,6 @@ ObservationSpec = Annotated[
     NoneObservation | ReadingSpec | JointSpec | TaxelCountsObservation | TaxelSaturatedObservation, Field(discriminator="type")
 ]
 
-TYPES: dict[str, type[Observation]] = {}
-"""All observation types by name: tgdsl's, those of installed packages once `known_types` was called, and registered ones."""
-GROUP = "tgdsl.observations"  # group of the entry points by which packages bring types
-
-
-def register(model: type[Observation]) -> None:
-    """Make a type known to all documents and artefacts that are read from now on.
-
-    Raises:
-        TgdslError: If it is no type, or another one has its name.
-    """
-    if wrong := _wrong(model):
-        raise TgdslError(wrong)
-    (name,) = get_args(model.model_fields["type"].annotation)
-    if TYPES.setdefault(name, model) is not model:
-        raise TgdslError(f'two observation types are called "{name}"; rename one')
-
 
 def _wrong(model: object) -> str:
     if not (isinstance(model, type) and issubclass(model, Observation)):
@@ -386,18 +369,22 @@ def _wrong(model: object) -> str:
     return "" if len(names) == 1 else f'{model.__name__} has no field `type: Literal["its_name"]`'
 
 
-for _model in get_args(get_args(ObservationSpec)[0]):
-    register(_model)
+TYPES = Registry(
+    *("tgdsl.observations", "observation type", "observation types"),
+    get_args(get_args(ObservationSpec)[0]),
+    _wrong,
+    lambda model: get_args(model.model_fields["type"].annotation)[0],
+)
+register = TYPES.register
 
 
-def known_types(names: Collection[str] = ()) -> tuple[type[Observation], ...]:
-    """Return all types; raise `TgdslError` if one of these names is not among them."""
-    for model, _ in installed(GROUP, "observation type", _wrong):
-        register(model)
-    if missing := set(names) - TYPES.keys():
+def types_of(names: Collection[str]) -> dict[str, type[Observation]]:
+    """Return the types with these names; raise `TgdslError` if there is no such type."""
+    types = TYPES.by_name()
+    if missing := set(names) - types.keys():
         problem = f'the observation type "{min(missing)}" is not known; install its package'
         raise TgdslError(f"{problem}, or `tgdsl.observations.observations.register` it")
-    return tuple(TYPES.values())
+    return {name: types[name] for name in names}
 
 
 HAND_ONLY = {"taxel_counts": 5 * 120 * 3, "taxel_saturated": 5 * 120}

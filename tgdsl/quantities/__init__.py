@@ -7,9 +7,8 @@ A package brings a quantity by an entry point, in its pyproject.toml:
 """
 
 import dataclasses
-from collections.abc import Sequence
 
-from tgdsl.files.plugins import known
+from tgdsl.files.plugins import Registry
 from tgdsl.quantities.base import Gathered, Planning, Quantity, Request, Scene, Use
 from tgdsl.quantities.contact_depth import CONTACT_DEPTH, ContactDepth
 from tgdsl.quantities.contacts import CONTACTS, LOADS, Contacts, Loads
@@ -30,20 +29,6 @@ __all__ = [
 QUANTITIES: tuple[Quantity, ...] = (CONTACT_DEPTH, CONTACTS, MOMENTS, POINTS, MOTION, PATCHES, LOADS, JOINTS, PLACES)
 
 
-def known_quantities(given: Sequence[Quantity] = ()) -> tuple[Quantity, ...]:
-    """Return all quantities: tgdsl's, then those of installed packages by package and name, then the given ones.
-
-    An installed quantity that cannot be imported is skipped; a warning says so once.
-
-    Args:
-        given: Quantities of the caller's own. One that an installed package brings too may be among them.
-
-    Raises:
-        TgdslError: If two quantities have one name, or a quantity that is given is none.
-    """
-    return known("tgdsl.quantities", "quantity", "quantities", QUANTITIES, given, _wrong)
-
-
 def _wrong(quantity: object) -> str:
     """Return why something is no quantity, or nothing."""
     if not isinstance(quantity, Quantity):
@@ -55,3 +40,7 @@ def _wrong(quantity: object) -> str:
     if any(mark in quantity.name for mark in "/."):
         return f'quantity "{quantity.name}": its name has "/" or ".", which part the names of arrays'
     return ""
+
+
+known_quantities = Registry[Quantity]("tgdsl.quantities", "quantity", "quantities", QUANTITIES, _wrong).known
+"""Returns all quantities: see `tgdsl.files.plugins.Registry.known`."""

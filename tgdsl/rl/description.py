@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from tgdsl.console.tables import text_table
-from tgdsl.observations.observations import TYPES, OfReading, PerLink
+from tgdsl.observations.observations import PerLink
 from tgdsl.rl.groups import link_forces, runs_of
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.sensed import Sensed, Source, sensors_document
@@ -93,8 +93,7 @@ def _touch(sensed: Sensed, source: Source, substeps: int) -> list[Features]:
     (term,) = (term for term in touch.plan.observations if term.group == source.observation)
     assert term.reading is not None
     (output,) = (output for output in touch.outputs if output.name == term.reading)
-    table, spec = touch.rows[term.reading], TYPES[term.type].model_validate({"type": term.type, "of": term.reading})
-    assert isinstance(spec, OfReading)
+    table, spec = touch.rows[term.reading], source.spec
     links = table["link" if "link" in (table.dtype.names or ()) else "body"].tolist()
     if isinstance(spec, PerLink):
         links, channels = list(dict.fromkeys(links)), spec.features

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -18,9 +18,9 @@ from tgdsl.console.progress import Progress
 from tgdsl.errors import SpecError, did_you_mean, listed
 from tgdsl.layout.layout import Layout
 from tgdsl.module.module import TactileModule
-from tgdsl.observations.observations import TYPES, PerLink
+from tgdsl.observations.observations import OfReading, PerLink
 from tgdsl.rl.load import LoadedTask
-from tgdsl.rl.spec import SENSED
+from tgdsl.rl.spec import touch_types
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.schema.load import Loaded, load
 from tgdsl.schema.select import matching
@@ -28,7 +28,6 @@ from tgdsl.sensors.known import known_kinds
 from tgdsl.tuning.compile import compile as compile_document
 
 GROUP = "tactile_sensors"  # the observation group of what a policy feels
-PER_LINK = tuple(name for name, model in TYPES.items() if issubclass(model, PerLink))  # types that have numbers of links
 CLEAN = "clean"  # the noise profile that has none
 
 
@@ -45,15 +44,32 @@ class Felt(NamedTuple):
         return f"{GROUP}/{self.type}/{self.placement}/{self.noise}"
 
     @property
+    def kind(self) -> str:
+        """The kind of its sensor."""
+        return touch_types()[self.type][0]
+
+    @property
+    def is_per_link(self) -> bool:
+        """Whether it has numbers of links, not of taxels."""
+        return issubclass(touch_types()[self.type][1], PerLink)
+
+    @property
     def observation(self) -> str:
         """The module's observation that the group is taken from."""
         return f"{GROUP}_{self.type}_{self.noise}"
+
+
+def _observation(type_: str, reading: str) -> OfReading:
+    """Return the observation of a reading that a word of `touch:` names."""
+    model = touch_types()[type_][1]
+    return model.model_validate({"type": get_args(model.model_fields["type"].annotation)[0], "of": reading})
 
 
 class Source(NamedTuple):
     """Where a group comes from: the module's observation, which of its columns (None: all), and the taxels that they are of."""
 
     observation: str
+    spec: OfReading
     columns: Int[Tensor, " feature"] | None
     layout: Layout
 
@@ -107,30 +123,30 @@ def compile_sensed(
     senses = loaded.senses if only is None else only
     of_policy = [] if only is not None or spec.touch == "none" else [spec.touch]
     types = of_policy if feels is None else [each.type for each in feels]
-    sensor = _sensors_of(loaded, document, {"task": senses, "touch": [SENSED[type_][0] for type_ in types]})
+    sensor = _sensors_of(loaded, document, {"task": senses, "touch": [touch_types()[type_][0] for type_ in types]})
     by_kind = {kind: sensor[kind] for kind in senses}
-    overrides, observations = _sensor_overrides(loaded), dict[str, Any]()
+    overrides, observations = _sensor_overrides(loaded), dict[str, OfReading]()
     if spec.resolution is not None:
         overrides["resolution"] = spec.resolution
     if spec.variants is not None:
         overrides[f"objects.{spec.object}.variants"] = _variants(loaded, document)
     if spec.physics.collision is not None:
         overrides["robot.collision"] = spec.physics.collision
-    felt, felts = None, {each: sensor[SENSED[each.type][0]] for each in feels or ()}
+    felt, felts = None, {each: sensor[each.kind] for each in feels or ()}
     if feels is not None:
         more, observations = _overrides(loaded, felts)
         overrides |= more
     elif of_policy:
-        kind, observed = SENSED[spec.touch]
-        felt = sensor[kind]
+        felt = sensor[touch_types()[spec.touch][0]]
         overrides |= {f"sensors.{felt}.links": spec.placement, f"sensors.{felt}.noise": spec.noise}
-        observations = {GROUP: [{"type": observed, "of": felt}]}
+        observations = {GROUP: _observation(spec.touch, felt)}
     contact = by_kind.get("link_contact")
     if contact:
         outputs = document.spec.sensors[contact].outputs  # type: ignore[attr-defined]
         forces = ("force", "normal_force") if loaded.task.wants_normal_force else ("force",)
         overrides[f"sensors.{contact}.outputs"] = list(dict.fromkeys((*outputs, *forces)))
-    overrides = {"observations": observations | dict(also or {})} | overrides
+    observed = {name: [observation.model_dump(exclude_unset=True)] for name, observation in observations.items()}
+    overrides = {"observations": observed | dict(also or {})} | overrides
     touch = compile_document(
         loaded.folder / spec.document,
         sensors=set(sensor.values()) or None,
@@ -139,9 +155,11 @@ def compile_sensed(
         progress=progress,
     )
     layouts = {planned.name: touch.plan.layout_of(planned) for planned in touch.plan.sensors}
-    groups = {each.group: _source(loaded, touch, each, layouts[name]) for each, name in felts.items()}
+    groups = {
+        each.group: _source(loaded, touch, each, observations[each.observation], layouts[name]) for each, name in felts.items()
+    }
     if felt:
-        groups[GROUP] = Source(GROUP, None, layouts[felt])
+        groups[GROUP] = Source(GROUP, observations[GROUP], None, layouts[felt])
     return Sensed(
         touch=touch,
         felt=felt,
@@ -154,9 +172,9 @@ def compile_sensed(
     )
 
 
-def _overrides(loaded: LoadedTask, felts: Mapping[Felt, str]) -> tuple[dict[str, Any], dict[str, Any]]:
+def _overrides(loaded: LoadedTask, felts: Mapping[Felt, str]) -> tuple[dict[str, Any], dict[str, OfReading]]:
     """Return what of the sensors' document is set for policies that feel several things, and the module's observations."""
-    result, observations = dict[str, Any](), dict[str, Any]()
+    result, observations = dict[str, Any](), dict[str, OfReading]()
     for sensor in dict.fromkeys(felts.values()):
         carried = [felt for felt, carrier in felts.items() if carrier == sensor]
         noises = list(dict.fromkeys(felt.noise for felt in carried if felt.noise != CLEAN))
@@ -169,31 +187,30 @@ def _overrides(loaded: LoadedTask, felts: Mapping[Felt, str]) -> tuple[dict[str,
         result[f"sensors.{sensor}.readout"] = "both" if is_both else "measured"
         for felt in carried:
             reading = f"{sensor}/clean" if is_both and felt.noise == CLEAN else sensor
-            observations[felt.observation] = [{"type": SENSED[felt.type][1], "of": reading}]
+            observations[felt.observation] = _observation(felt.type, reading)
     return result, observations
 
 
-def _source(loaded: LoadedTask, touch: TactileModule, felt: Felt, layout: Layout) -> Source:
+def _source(loaded: LoadedTask, touch: TactileModule, felt: Felt, spec: OfReading, layout: Layout) -> Source:
     """Return where a group comes from: of the sensor's taxels or links those of the placement."""
     links = [link.name for link in layout.links]
     names = layout.groups.get(felt.placement) or tuple(matching(felt.placement, links))
     if set(names) == set(links):
-        return Source(felt.observation, None, layout)
+        return Source(felt.observation, spec, None, layout)
     taxels = layout.taxels_of(names)
     size = sum(term.num_features for term in touch.plan.observations if term.group == felt.observation)
-    is_per_link = felt.type in PER_LINK
-    rows = np.flatnonzero([name in names for name in links]) if is_per_link else taxels
-    num_rows = len(links) if is_per_link else layout.num_taxels
+    rows = np.flatnonzero([name in names for name in links]) if felt.is_per_link else taxels
+    num_rows = len(links) if felt.is_per_link else layout.num_taxels
     if not num_rows or size % num_rows:
         problem = f'"{felt.type}" cannot be felt at {felt.placement} beside other links: its numbers are not of taxels'
         raise loaded.error(("placement",), problem)
     columns = (np.arange(size // num_rows)[:, None] * num_rows + rows).ravel()
-    return Source(felt.observation, torch.from_numpy(columns).to(touch.device), layout.take(taxels))
+    return Source(felt.observation, spec, torch.from_numpy(columns).to(touch.device), layout.take(taxels))
 
 
 def check_felt(loaded: LoadedTask, feels: Sequence[Felt]) -> None:
     """Raise `SpecError` if the sensors' document lacks a sensor for something that is felt, or has mistakes."""
-    _sensors_of(loaded, sensors_document(loaded), {"touch": [SENSED[each.type][0] for each in feels]})
+    _sensors_of(loaded, sensors_document(loaded), {"touch": [each.kind for each in feels]})
 
 
 def types_of(loaded: LoadedTask) -> list[str]:
@@ -202,7 +219,7 @@ def types_of(loaded: LoadedTask) -> list[str]:
 
 
 def _types(kinds: Sequence[str]) -> list[str]:
-    return ["none", *(name for name, (kind, _) in SENSED.items() if kind in kinds)]
+    return ["none", *(name for name, (kind, _) in touch_types().items() if kind in kinds)]
 
 
 def num_variants(loaded: LoadedTask) -> int:

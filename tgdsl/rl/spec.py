@@ -4,21 +4,38 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, StrictInt, model_validator
+from pydantic import AfterValidator, Field, StrictInt, model_validator
 
+from tgdsl.errors import did_you_mean
 from tgdsl.fields.models import NonNegative, Positive, Quantity, Radius, Range, RangeOf, SpecModel
-from tgdsl.observations.observations import TYPES
+from tgdsl.observations.observations import TYPES, ForceObservation, OfReading, ReadingObservation
 from tgdsl.rl.actuation import ONE, ZERO, ActionSpec, DriveSpec, Factor
 from tgdsl.rl.students.spec import DistillSpec
 from tgdsl.rl.train.spec import Time, TrainSpec, Whole
 
-SENSED: dict[str, tuple[str, str]] = {
-    **{name: (kind, name) for name, model in TYPES.items() if (kind := getattr(model, "task_kind", ""))},
-    "force_taxel": ("force_taxel", "force"),
-    "temperature": ("temperature_grid", "reading"),
-}
-"""By a word of `touch:`, the kind of sensor that the policy feels with, and the observation that is made of its reading."""
-TouchType = Literal["none", *SENSED]  # type: ignore
+
+def touch_types() -> dict[str, tuple[str, type[OfReading]]]:
+    """Return, by word of `touch:`, the kind of sensor that a policy feels with, and the type of observation of its reading."""
+    named = {
+        name: (model.task_kind, model)
+        for name, model in TYPES.by_name().items()
+        if issubclass(model, OfReading) and model.task_kind
+    }
+    return named | {"force_taxel": ("force_taxel", ForceObservation), "temperature": ("temperature_grid", ReadingObservation)}
+
+
+def _touch_type(name: str) -> str:
+    names = ("none", *touch_types())
+    if name not in names:
+        raise ValueError(f'unknown type "{name}"; {did_you_mean(name, names, "types")}')
+    return name
+
+
+def _list_touch_types(schema: dict[str, Any]) -> None:
+    schema["enum"] = ["none", *touch_types()]
+
+
+TouchType = Annotated[str, AfterValidator(_touch_type), Field(json_schema_extra=_list_touch_types)]
 ForceRange = Annotated[Range, RangeOf("force")]
 Impedance = Annotated[float, Quantity("number", ge=1e-4), Field(le=0.9999)]  # between the bounds that MuJoCo has
 Power = Annotated[float, Quantity("number", ge=1.0)]
@@ -153,7 +170,7 @@ class TaskSpec(SpecModel):
     """How physics is stepped."""
     episode: Annotated[float, Quantity("time", gt=0.0), Field(le=1e6)] = 10.0
     """Duration of an episode [s]."""
-    touch: TouchType = "force_torque"  # type: ignore
+    touch: TouchType = "force_torque"
     """What a policy feels."""
     placement: str = "hand"
     """Links that feel: a link group of the layout."""

@@ -18,7 +18,7 @@ from typing import Any, Literal, Unpack, overload
 import torch
 
 from tgdsl.errors import HandError, SimulationError, TgdslError, did_you_mean, listed
-from tgdsl.files.plugins import known
+from tgdsl.files.plugins import Registry
 from tgdsl.module.module import TactileModule
 from tgdsl.module.taxels import Taxels, check_taxels
 from tgdsl.observations.observations import HAND_ONLY, hand_only_error
@@ -289,19 +289,12 @@ SOURCES: tuple[SourceKind, ...] = (
 """The kinds of tgdsl."""
 
 
-def known_sources() -> tuple[SourceKind, ...]:
-    """Return all kinds of sources: tgdsl's, then installed ones by package and name.
-
-    An installed kind that cannot be imported is left out, with a warning the first time.
-
-    Raises:
-        TgdslError: If two kinds have one name.
-    """
-    return known("tgdsl.sources", "source", "kinds of sources", SOURCES, (), _wrong)
-
-
 def _wrong(kind: object) -> str:
     return "" if isinstance(kind, SourceKind) else f"found {type(kind).__name__}, expected a {SourceKind.__name__}"
+
+
+known_sources = Registry("tgdsl.sources", "source", "kinds of sources", SOURCES, _wrong).known
+"""Returns all kinds of sources: see `tgdsl.files.plugins.Registry.known`."""
 
 
 def kind_of(source: str) -> SourceKind:

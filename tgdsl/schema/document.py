@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Union
 from pydantic import Field, StringConstraints, Tag, create_model
 
 from tgdsl.fields.models import TEXT_OR_OTHER, SpecModel, Text
-from tgdsl.observations.observations import Observation, ObservationSpec, known_types
+from tgdsl.observations.observations import TYPES, Observation, ObservationSpec
 from tgdsl.schema.objects import ObjectSpec
 from tgdsl.schema.placement import LayoutSpec
 from tgdsl.sensors import KINDS, Kind
@@ -17,7 +17,7 @@ from tgdsl.sensors.base import AnySensorSpec, ProbeSpec
 from tgdsl.sensors.known import known_kinds
 from tgdsl.sensors.noise import NoiseSpec
 from tgdsl.sensors.noise.pipeline import more_knobs
-from tgdsl.sensors.noise.spec import noise_model
+from tgdsl.sensors.noise.profiles import noise_model
 
 Schema = dict[str, Any]
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_-]*$")]
@@ -67,7 +67,7 @@ class Spec(SpecModel):
 
 def document_model(kinds: tuple[Kind, ...] = KINDS, needs_sensors: bool = True) -> type[Spec]:
     """Return the document model with sensors of the given kinds, all known stages of noise and types of observations."""
-    return _document_model(kinds, needs_sensors, more_knobs(), known_types())
+    return _document_model(kinds, needs_sensors, more_knobs(), TYPES.known())
 
 
 @cache

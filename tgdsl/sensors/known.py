@@ -15,14 +15,13 @@ from typing import Any
 import numpy as np
 
 from tgdsl.errors import LowerError, TgdslError, did_you_mean
-from tgdsl.files.plugins import known
+from tgdsl.files.plugins import Registry
 from tgdsl.quantities import known_quantities
 from tgdsl.quantities.base import Quantity, Request
 from tgdsl.sensors import KINDS
 from tgdsl.sensors.base import AnySensorSpec, Axis, Kind, Lowered, Memory
 from tgdsl.sensors.upstream import SOUND
 
-GROUP = "tgdsl.kinds"  # group of the entry points by which packages bring kinds
 ARGUMENTS = {
     "lower": ("spec", "layout", "surface_of"),
     "forward": ("gathered", "context", "constants", "state"),
@@ -31,20 +30,6 @@ ARGUMENTS = {
 }
 """Arguments of a kind's functions, in order."""
 FORMER = {"probes"}  # names of arguments from before kinds made requests
-
-
-def known_kinds(given: Sequence[Kind] = ()) -> tuple[Kind, ...]:
-    """Return all kinds: of tgdsl, of installed packages by package and name, and of the caller.
-
-    An installed kind that cannot be imported is left out, with one warning.
-
-    Args:
-        given: Kinds of the caller, which installed packages may provide too.
-
-    Raises:
-        TgdslError: If two kinds have one name, or one of `given` is not a kind.
-    """
-    return known(GROUP, "sensor kind", "kinds", KINDS, given, _wrong)
 
 
 def kinds_by_sensor(kinds: Sequence[Kind], wanted: Mapping[str, str]) -> dict[str, Kind]:
@@ -181,3 +166,7 @@ def _wrong_call(kind: str, name: str, call: Any) -> str:
     result = ", ".join(signature.parameters)
     hint = "the CHANGELOG has the names from when kinds began to make requests"
     return f'kind "{kind}": found `{name}({result})`, expected `{name}({", ".join(arguments)})`; {hint}'
+
+
+known_kinds = Registry("tgdsl.kinds", "sensor kind", "kinds", KINDS, _wrong).known
+"""Returns all kinds: see `tgdsl.files.plugins.Registry.known`."""

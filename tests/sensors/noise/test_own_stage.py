@@ -18,7 +18,7 @@ import tgdsl
 from tgdsl.errors import TgdslError
 from tgdsl.schema.document import json_schema
 from tgdsl.sensors.noise import NoiseSpec, pipeline, register
-from tgdsl.sensors.noise.spec import noise_model
+from tgdsl.sensors.noise.profiles import noise_model
 
 FILE = Path(__file__).parents[3] / "examples" / "plugins" / "saturation.py"
 
@@ -26,7 +26,7 @@ FILE = Path(__file__).parents[3] / "examples" / "plugins" / "saturation.py"
 @pytest.fixture
 def saturation(monkeypatch):
     """The stage of the example, registered for one test."""
-    monkeypatch.setattr(pipeline, "_registered", [])
+    monkeypatch.setattr(pipeline.REGISTRY, "registered", ())
     spec = importlib.util.spec_from_file_location("saturation", FILE)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -74,7 +74,7 @@ def test_profiles_links_and_artefacts_have_it(tmp_path, saturation, monkeypatch)
     tgdsl.save(touch, tmp_path / "touch.safetensors")
     state = touch.example_state(2)
     assert torch.equal(tgdsl.load(tmp_path / "touch.safetensors")(state)["s"], touch(state)["s"])
-    monkeypatch.setattr(pipeline, "_registered", [])
+    monkeypatch.setattr(pipeline.REGISTRY, "registered", ())
     with pytest.raises(TgdslError, match=r'the noise stage "saturation" is not known; install its package, or `tgdsl'):
         tgdsl.load(tmp_path / "touch.safetensors")
 
@@ -103,7 +103,7 @@ def test_a_stage_with_the_draw_of_another(saturation, tmp_path, monkeypatch):
 
 
 def test_an_installed_stage_is_there_without_being_registered(tmp_path, monkeypatch):
-    with installing(tmp_path, monkeypatch, pipeline.GROUP, FILE.read_text()) as install:
+    with installing(tmp_path, monkeypatch, pipeline.REGISTRY.group, FILE.read_text()) as install:
         install("clips", "1.0", saturation="clips:Saturation")
         touch = tgdsl.compile(document(tmp_path, "kinematic_taxel", {"saturation": 0.1}))
         assert touch.plan.sensors[0].noise.terms == ("saturation",)

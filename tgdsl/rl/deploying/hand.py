@@ -38,7 +38,7 @@ from tgdsl.rl.playing.policy import (
     check_learned,
     read_policy,
 )
-from tgdsl.rl.sensed import GROUP, PER_LINK, Felt, Sensed, compile_sensed
+from tgdsl.rl.sensed import GROUP, Felt, Sensed, compile_sensed
 from tgdsl.rl.spec import ProprioSpec
 from tgdsl.rl.start import moved_joints
 from tgdsl.rl.task import HandNow
@@ -124,7 +124,7 @@ def prepare(
         problem = f"this policy feels at each of {spec.physics.substeps} physics steps of a control step (temporal: stack)"
         raise DeployError(f"{policy}: {problem}, and a hand feels once; teach one with temporal: last")
     feels = [] if felt is None else [felt]
-    if is_emulated and felt is not None and felt.type in PER_LINK and felt.type != EMULATED:
+    if is_emulated and felt is not None and felt.is_per_link and felt.type != EMULATED:
         feels.append(felt._replace(type=EMULATED))
     also = {name: [{"type": name}] for name in (JOINT_POS, JOINT_VEL)}
     sensed = compile_sensed(loaded, device, progress, feels=feels, also=also)

@@ -28,8 +28,8 @@ from tgdsl.rl.playing.policy import (
     check_learned,
     read_policy,
 )
-from tgdsl.rl.sensed import GROUP, PER_LINK, SENSED, Felt, compile_sensed
-from tgdsl.rl.spec import PushSpec
+from tgdsl.rl.sensed import GROUP, Felt, compile_sensed
+from tgdsl.rl.spec import PushSpec, touch_types
 from tgdsl.rl.students.spec import StudentNetworksSpec
 from tgdsl.rl.students.student import Architecture, Encoder, Grid
 
@@ -60,7 +60,7 @@ class StudentKey:
 
 def student_keys(types: Sequence[str], placements: Sequence[str], noises: Sequence[str], seeds: int) -> list[StudentKey]:
     """Return a student per type, placement, noise and seed; of those that feel nothing, one per seed."""
-    all_types = [NONE, *SENSED]
+    all_types = [NONE, *touch_types()]
     selected = [name for type_ in types for name in (all_types if type_ == "all" else [type_])]
     for name in selected:
         if name not in all_types:
@@ -136,7 +136,7 @@ def architecture(loaded: LoadedTask, env: TouchEnv, key: StudentKey, names: Sequ
 
 def _touch_encoder(networks: StudentNetworksSpec, felt: Felt, layout: Layout, size: int) -> Encoder:
     widths, kind = networks.touch_encoder, networks.touch_kind
-    if kind in ("cnn", "convrnn") and felt.type not in PER_LINK and layout.num_taxels and size % layout.num_taxels == 0:
+    if kind in ("cnn", "convrnn") and not felt.is_per_link and layout.num_taxels and size % layout.num_taxels == 0:
         return Encoder(
             kind, networks.convolution.channels, widths.size, networks.convolution.kernel, grid_of(layout, size, felt)
         )

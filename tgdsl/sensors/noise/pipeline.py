@@ -17,39 +17,16 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.errors import LowerError, TgdslError, did_you_mean
-from tgdsl.files.plugins import installed
+from tgdsl.files.plugins import Registry
 from tgdsl.layout.layout import Layout
 from tgdsl.sensors.noise import random
-from tgdsl.sensors.noise.spec import ALL, Knobs, quantity, range_of
+from tgdsl.sensors.noise.profiles import Knobs
+from tgdsl.sensors.noise.spec import ALL, quantity, range_of
 from tgdsl.sensors.noise.stage import Now, Signal, Stage
 from tgdsl.sensors.noise.stages import STAGES
 from tgdsl.tensors.fusion import materialised
 
 StageType = type[Stage]
-GROUP = "tgdsl.noise_stages"  # group of the entry points by which packages bring stages
-_registered: list[StageType] = []
-
-
-def register(stage: StageType) -> None:
-    """Make a stage known to all documents and artefacts that are read from now on."""
-    _registered.append(stage)
-
-
-def more_stages() -> tuple[StageType, ...]:
-    """Return the stages of installed packages and the registered ones.
-
-    Raises:
-        TgdslError: If two stages share a knob, a number or its draw.
-    """
-    more = (*(stage for stage, _ in installed(GROUP, "noise stage", _wrong)), *_registered)
-    names: dict[object, str] = {}
-    for stage in (*STAGES, *more):
-        draws = [number.draw for number in stage.numbers.values() if number.draw is not None]
-        for name in (*stage.Knobs.model_fields, *(f"number {name}" for name in stage.numbers), *draws):
-            if (other := names.setdefault(name, stage.name)) != stage.name:
-                shared = f"the draw {name}" if isinstance(name, int) else f'"{name}"'
-                raise TgdslError(f'the noise stages "{other}" and "{stage.name}" both have {shared}; expected another one')
-    return more
 
 
 def _wrong(stage: object) -> str:
@@ -59,20 +36,34 @@ def _wrong(stage: object) -> str:
     return f"found {type_name}, expected a subclass of tgdsl.sensors.noise.stage.Stage"
 
 
+REGISTRY = Registry("tgdsl.noise_stages", "noise stage", "noise stages", STAGES, _wrong)
+register = REGISTRY.register
+
+
 def more_knobs() -> tuple[type[Any], ...]:
-    """Return the models of the knobs of `more_stages`."""
-    return tuple(stage.Knobs for stage in more_stages())
+    """Return the models of the knobs of stages that are not tgdsl's."""
+    return tuple(stage.Knobs for stage in REGISTRY.known()[len(STAGES) :])
 
 
 def knobs_of(knobs: frozenset[str]) -> frozenset[str]:
-    """Return the knobs of a kind and of `more_stages`; none if the kind has none."""
+    """Return the knobs of a kind, and those of stages that are not tgdsl's; none if the kind has none."""
     return knobs.union(*(model.model_fields for model in more_knobs())) if knobs else knobs
 
 
 def known_stages() -> tuple[StageType, ...]:
-    """Return all stages in their order."""
-    result = list(STAGES)
-    for stage in more_stages():
+    """Return all stages in their order.
+
+    Raises:
+        TgdslError: If two stages share a knob, a number or its draw.
+    """
+    stages, result, owners = REGISTRY.known(), list(STAGES), dict[object, str]()
+    for stage in stages:
+        draws = [number.draw for number in stage.numbers.values() if number.draw is not None]
+        for name in (*stage.Knobs.model_fields, *(f"number {name}" for name in stage.numbers), *draws):
+            if (other := owners.setdefault(name, stage.name)) != stage.name:
+                shared = f"the draw {name}" if isinstance(name, int) else f'"{name}"'
+                raise TgdslError(f'the noise stages "{other}" and "{stage.name}" both have {shared}; expected another one')
+    for stage in stages[len(STAGES) :]:
         names = [other.name for other in result]
         result.insert(names.index(stage.after) + 1 if stage.after in names else len(result), stage)
     return tuple(result)

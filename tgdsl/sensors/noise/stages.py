@@ -22,17 +22,29 @@ Source: Chung et al., *Tactile Genesis*, appendix, "Sensor Noise Model".
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from pydantic import model_validator
 from torch import Tensor
 
+from tgdsl.fields.models import Range, RangeOf, SpecModel, Usual
 from tgdsl.layout.layout import Layout
 from tgdsl.sensors.noise import random
 from tgdsl.sensors.noise.reference import ReferenceCall, normal_pair
 from tgdsl.sensors.noise.reference import Signal as ReferenceSignal
+from tgdsl.sensors.noise.spec import (
+    NO_AMPLITUDE,
+    ZERO,
+    AnyAmplitude,
+    Factor,
+    LengthRange,
+    NonNegativeAmplitude,
+    Share,
+    TimeRange,
+)
 from tgdsl.sensors.noise.stage import NoMemory, Now, Number, Signal, Stage, Table, compact, uniform
 from tgdsl.tensors.fusion import materialised
 from tgdsl.tensors.link_products import LINK_PRODUCTS
@@ -42,6 +54,13 @@ class Radius(Stage):
     """Disturbs radii by `shift`; the signal stays as it is."""
 
     name = "radius_noise"
+
+    class Knobs(SpecModel):
+        """Knob of `Radius`."""
+
+        radius_noise: Annotated[LengthRange, Usual("length", high=0.1)] = ZERO
+        """ρ, half-width of the uniform disturbance of each probe's radius, drawn at each reading [m]."""
+
     radius_noise: Annotated[Tensor, Number(0, unit=" m", stream=random.RADIUS)]
     """ρ [m]."""
 
@@ -61,6 +80,19 @@ class Gain(Stage):
     """x ← γ_j x."""
 
     name = "gain"
+
+    class Knobs(SpecModel):
+        """Knob of `Gain`."""
+
+        gain: tuple[Factor, Factor] = ((1.0, 1.0), (1.0, 1.0))
+        """Lowest and highest gain: each probe draws its own at reset."""
+
+        @model_validator(mode="after")
+        def _ordered(self) -> Self:
+            if self.gain[0][0] > self.gain[1][1]:
+                raise ValueError(f"gain [{self.gain[0][0]:g}, {self.gain[1][1]:g}] is not ordered, expected [low, high]")
+            return self
+
     gain_low: Annotated[Tensor, Number(1, "from ", knob="gain.0", neutral=1.0, stream=random.GAIN)]
     gain_high: Annotated[Tensor, Number(2, "to ", knob="gain.1", neutral=1.0, stream=random.GAIN)]
 
@@ -78,6 +110,15 @@ class Gain(Stage):
         return (low + call.uniform(random.GAIN)[:, :1] * (high - low)) * signal
 
 
+class MaxwellBranch(SpecModel):
+    """Viscoelastic memory of the substrate: one Maxwell branch."""
+
+    strength: Annotated[Range, RangeOf("number", ge=0.0)]
+    """β, overshoot after a step, as a share of the step."""
+    time_constant: Annotated[Range, RangeOf("time", gt=0.0), Usual("time", high=3600.0)]
+    """τ, time constant of the decay [s]."""
+
+
 class HysteresisMemory(NamedTuple):
     """ξ, and the signal of the last call."""
 
@@ -91,6 +132,13 @@ class Hysteresis(Stage):
     name = "hysteresis"
     Memory = HysteresisMemory
     needs_dt = True
+
+    class Knobs(SpecModel):
+        """Knob of `Hysteresis`."""
+
+        hysteresis: MaxwellBranch | None = None
+        """Viscoelastic memory."""
+
     hysteresis_strength: Annotated[Tensor, Number(3, "strength ", knob="hysteresis.strength")]
     """β [1]."""
     hysteresis_time: Annotated[Tensor, Number(4, "time constant ", " s", "hysteresis.time_constant", (1.0, 1.0), None)]
@@ -128,6 +176,15 @@ class Delay(Stage):
     name = "delay"
     Memory = DelayMemory
     needs_dt = True
+
+    class Knobs(SpecModel):
+        """Knobs of `Delay`."""
+
+        read_delay: Annotated[TimeRange, Usual("time", high=1.0)] = ZERO
+        """Age of the signal that is read [s]; between two calls the signal counts as linear."""
+        jitter: Annotated[TimeRange, Usual("time", high=1.0)] = ZERO
+        """Largest additional age, drawn uniformly at each reading for all taxels together [s]."""
+
     read_delay: Annotated[Tensor, Number(7, unit=" s")]
     """Δ_read [s]."""
     jitter: Annotated[Tensor | None, Number(8, "jitter ", " s", stream=random.JITTER)]
@@ -188,6 +245,17 @@ class Offset(Stage):
     name = "offset"
     Memory = OffsetMemory
     is_split = True
+
+    class Knobs(SpecModel):
+        """Knobs of `Offset`."""
+
+        bias: AnyAmplitude = NO_AMPLITUDE
+        """Constant offset [unit of the reading]."""
+        white_noise: NonNegativeAmplitude = NO_AMPLITUDE
+        """σ, standard deviation of additive Gaussian noise [unit of the reading]."""
+        drift: NonNegativeAmplitude = NO_AMPLITUDE
+        """Standard deviation of the random walk's step at each reading [unit of the reading]; the walk starts at reset."""
+
     bias: Annotated[Tensor | None, Number(9, unit=None)]
     """b."""
     white_noise: Annotated[Tensor | None, Number(10, unit=None, stream=random.READING)]
@@ -230,6 +298,13 @@ class Quantization(Stage):
     """y ← q round(y/q)."""
 
     name = "quantization"
+
+    class Knobs(SpecModel):
+        """Knob of `Quantization`."""
+
+        quantization: NonNegativeAmplitude = NO_AMPLITUDE
+        """Step of the quantiser [unit of the reading]; 0: none."""
+
     quantization: Annotated[Tensor, Number(12, unit=None)]
     """q."""
 
@@ -249,6 +324,15 @@ class Dead(Stage):
     """y ← z_j where M_j."""
 
     name = "dead"
+
+    class Knobs(SpecModel):
+        """Knobs of `Dead`."""
+
+        dead_probability: Share = ZERO
+        """Chance that a taxel is dead for an episode."""
+        dead_range: tuple[AnyAmplitude, AnyAmplitude] = (NO_AMPLITUDE, NO_AMPLITUDE)
+        """Lowest and highest stuck reading of a dead taxel, drawn at reset [unit of the reading]."""
+
     dead_probability: Annotated[Tensor, Number(13, "probability ", stream=random.DEAD)]
     """p."""
     dead_low: Annotated[Tensor, Number(14, "stuck from ", None, "dead_range.0", neutral=None)]
@@ -283,6 +367,13 @@ class Release(Stage):
     """Release threshold of bits [m]. It replaces the constant that `decide` of the kind reads; the signal stays as it is."""
 
     name = "release_threshold"
+
+    class Knobs(SpecModel):
+        """Knob of `Release`."""
+
+        release_threshold: Annotated[LengthRange | None, Usual("length", high=0.1)] = None
+        """Depth below which a `contact` taxel switches off again [m]; default: the sensor's own."""
+
     release_threshold: Annotated[Tensor, Number(16, unit=" m", absent=(-1.0, -1.0))]
 
     @classmethod
@@ -296,6 +387,15 @@ NEGLIGIBLE = 1e-14
 are ten times slower."""
 
 
+class Neighbourhood(SpecModel):
+    """Mixing of neighbouring taxels of a link; the sum over its taxels stays what it is."""
+
+    strength: Share
+    """χ, share of each taxel's signal that goes to its neighbourhood."""
+    sigma: Annotated[Range, RangeOf("length", gt=0.0), Usual("length", high=0.1)]
+    """Standard deviation of the Gaussian neighbourhood [m]."""
+
+
 class Crosstalk(Stage):
     """Spreads each taxel's signal over its link, a product for each: with W, or with G where χ or σ differ between episodes.
 
@@ -307,6 +407,13 @@ class Crosstalk(Stage):
     """
 
     name = "crosstalk"
+
+    class Knobs(SpecModel):
+        """Knob of `Crosstalk`."""
+
+        crosstalk: Neighbourhood | None = None
+        """Mixing of neighbouring taxels."""
+
     crosstalk_strength: Annotated[Tensor | None, Number(5, "strength ", knob="crosstalk.strength")]
     """χ; None where it is part of the kernels."""
     crosstalk_sigma: Annotated[None, Number(None, knob="crosstalk.sigma", absent=(1.0, 1.0), neutral=None)]
@@ -401,3 +508,13 @@ def _reference_column(layout: Layout | None, i: int, sigma: float) -> Float[np.n
 
 STAGES: tuple[type[Stage], ...] = (Radius, Gain, Hysteresis, Crosstalk, Delay, Offset, Quantization, Dead, Release)
 """The stages of tgdsl, in their order."""
+
+
+def _knobs(*stages: type[Stage]) -> frozenset[str]:
+    return frozenset(name for stage in stages for name in stage.Knobs.model_fields)
+
+
+BASE = _knobs(Delay, Offset, Quantization)  # knobs of every kind
+PROBE = BASE | _knobs(Radius)  # knobs of a kind that reads distances
+TAXEL = PROBE | _knobs(Gain, Dead, Hysteresis)  # knobs of a kind that reads contact
+FORCE = TAXEL | _knobs(Crosstalk)  # knobs of a kind whose taxels read forces
