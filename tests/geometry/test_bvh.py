@@ -173,13 +173,14 @@ def test_backward_against_finite_differences():
 
 
 def test_farther_than_the_reach():
+    """Outside, distances end at the reach; inside they do not, so a deep contact keeps its depth and direction."""
     mesh = TriangleMesh(*cube())
-    points = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, 0.0], [0.0, 0.0, 0.021], [0.0, 0.0, torch.inf]], requires_grad=True)
+    points = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, 0.005], [0.0, 0.0, 0.021], [0.0, 0.0, torch.inf]], requires_grad=True)
     distance, gradient = nearest(points.unbind(-1), [mesh], 0.005)
     distance.sum().backward()
-    torch.testing.assert_close(distance, torch.tensor([0.005, -0.005, 0.001, 0.005]), rtol=0, atol=1e-6)
-    assert torch.stack(gradient, dim=-1).tolist() == [[1, 0, 0], [1, 0, 0], [0, 0, 1], [1, 0, 0]]
-    assert points.grad is not None and points.grad.tolist() == [[0, 0, 0], [0, 0, 0], [0, 0, 1], [0, 0, 0]]
+    torch.testing.assert_close(distance, torch.tensor([0.005, -0.015, 0.001, 0.005]), rtol=0, atol=1e-6)
+    assert torch.stack(gradient, dim=-1).tolist() == [[1, 0, 0], [0, 0, 1], [0, 0, 1], [1, 0, 0]]
+    assert points.grad is not None and points.grad.tolist() == [[0, 0, 0], [0, 0, 1], [0, 0, 1], [0, 0, 0]]
 
 
 def test_nan():

@@ -114,9 +114,9 @@ def nearest(
 ) -> tuple[Tensor, Vec]:
     """Return the signed distance [m] of points to a mesh, negative inside, and its outward unit gradient.
 
-    The derivative of the distance is the gradient; the gradient itself has none. Points farther than `max_distance` [m] read
-    it, negative if inside; their gradient is (1, 0, 0), and the derivative 0. NaN points read NaN. Of several meshes each point
-    asks the one that `which` names.
+    The derivative of the distance is the gradient; the gradient itself has none. Points outside that are farther than
+    `max_distance` [m] read it; their gradient is (1, 0, 0), and the derivative 0. Inside there is no limit. NaN reads NaN.
+    Of several meshes each point asks the one that `which` names.
     """
     stacked = torch.stack(point, dim=-1)
     flat = stacked.reshape(-1, 3).to(torch.float64).contiguous()
@@ -254,6 +254,12 @@ def _kernel(wp: Any) -> Any:
         face, away = nearest_face(mesh, corners, boxes, faces, p, size, max_distance)
         length, sign, probe, direction = max_distance, one, p, wp.vec3d(one, zero, zero)
         is_decided = wp.abs(p[0]) > half[0] or wp.abs(p[1]) > half[1] or wp.abs(p[2]) > half[2]
+        if face < 0 and not is_decided:
+            inside = wp.mesh_query_point_sign_winding_number(mesh, wp.vec3(p), wp.inf)
+            is_decided = True
+            if inside.result and inside.sign < 0.0:
+                sign = -one
+                face, away = nearest_face(mesh, corners, boxes, faces, p, size, size)
         if face >= 0:
             length = wp.length(away)
             direction = away / length
