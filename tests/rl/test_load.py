@@ -11,7 +11,7 @@ import torch
 from ruamel.yaml import YAML
 from tiny_tasks import tiny_env, write_task
 
-from tgdsl.errors import SimulationError, SpecError
+from tgdsl.errors import SimulationError, SpecError, TgdslError
 from tgdsl.observations.observations import TYPES, PerLink
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task, task_schema
@@ -19,6 +19,7 @@ from tgdsl.rl.playing.evaluation import evaluate
 from tgdsl.rl.playing.policy import provenance
 from tgdsl.rl.playing.rollout import ZeroActor
 from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
+from tgdsl.rl.terms import TERMS, RewardTerm
 
 REPOSITORY = Path(__file__).parents[2]
 DOCUMENTS = sorted(
@@ -338,3 +339,20 @@ def test_a_registered_observation_is_a_word_of_touch(tmp_path, monkeypatch):
     names = [feature.name for _, feature in env.describe()["tactile_sensors"]]
     assert names == ["largest depth"] * env.groups["tactile_sensors"]
     assert "deepest" in task_schema()["$defs"]["TaskSpec"]["properties"]["touch"]["enum"]
+
+
+class SpinRate(RewardTerm):
+    """Spin of the object."""
+
+    def rate(self, now, setup):
+        return now.object.angvel.norm(dim=1)
+
+
+def test_a_document_names_the_terms_of_packages(tmp_path, monkeypatch):
+    task = write_task(tmp_path, more="terms: {whirl: {term: spin_rate, weight: 2}}\n")
+    (found,) = problems(lambda: load_task(task))
+    assert found.path == "terms.whirl.term" and 'there is no term "spin_rate"' in found.what
+    monkeypatch.setattr(TERMS, "registered", (SpinRate,))
+    assert load_task(task).terms == {"whirl": SpinRate(term="spin_rate", weight=2.0)}
+    with pytest.raises(TgdslError, match="RewardTerm lacks rate"):
+        TERMS.register(RewardTerm)

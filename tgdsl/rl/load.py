@@ -90,11 +90,11 @@ def load_task(document: str | PathLike[str] | Mapping[str, Any], overrides: Mapp
 
 def _terms(source: Source, folder: Path, task: type[Task[Any]], spec: TaskSpec, problems: list[Problem]) -> dict[str, Term]:
     """Return the terms that a document adds; note what is wrong with them."""
-    terms = {}
+    terms, known_terms = {}, TERMS.by_name()
     for name, value in spec.terms.items():
         place = ("terms", name)
         try:
-            class_ = _class_of(source, folder, (*place, "term"), str(value.get("term", name)), Term, TERMS, "terms")
+            class_ = _class_of(source, folder, (*place, "term"), str(value.get("term", name)), Term, known_terms, "terms")
         except SpecError as error:
             problems += error.problems
             continue

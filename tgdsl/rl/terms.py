@@ -3,7 +3,8 @@
 A `RewardTerm` adds a rate to the reward, a `TerminationTerm` ends episodes, an `ObservationTerm` adds a group of observations;
 an `EventTerm` changes the simulation at random; a `CurriculumTerm` changes a weight or another number of a term while a policy
 is learned.
-`TERMS` has those that documents may name; a user's own is a subclass, named as `file.py:Class`.
+`TERMS` has those that documents may name, those of installed packages included; a user's own is a subclass, named as
+`file.py:Class`.
 
 Symbols: a action; q, q̇ and τ positions, velocities and torques of the joints that the policy moves, m and h middle and half
 width of their ranges; f_l the object's force on link l, d_p the distance from probe p to the object; τ_max the largest torques
@@ -33,8 +34,9 @@ from pydantic import Field, create_model, model_validator
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from tgdsl.errors import SimulationError, did_you_mean
+from tgdsl.errors import SimulationError, did_you_mean, listed
 from tgdsl.fields.models import Number, Positive, PositiveLength, Quantity, Range, RangeOf, SpecModel
+from tgdsl.files.plugins import Registry
 from tgdsl.rl import groups, rotations
 from tgdsl.rl.actuation import ZERO, Actuation, Factor
 from tgdsl.rl.draws import within
@@ -487,9 +489,23 @@ class HandTask(Task[S]):
     work = Work.of_task(-5e-3)
 
 
+def term_name(term: type[Term]) -> str:
+    """Return the name of a term in documents: `object_speed` of `ObjectSpeed`."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", term.__name__).lower()
+
+
 _TERMS = (
     *(ActionRate, JointLimit, Work, Effort, ContactForce, Near, NetForce, ObjectSpeed, ForceLimit, SpeedLimit, ScoreLimit),
     *(LinkForce, ObjectState, ObjectVelocity, Friction, Mass, Placement, Drive, Push, Linear),
 )
-TERMS: Mapping[str, type[Term]] = {re.sub(r"(?<=[a-z])(?=[A-Z])", "_", term.__name__).lower(): term for term in _TERMS}
-"""The terms that documents may name."""
+
+
+def _wrong(term: object) -> str:
+    if not (isinstance(term, type) and issubclass(term, Term)):
+        return f"found {term!r}, expected a subclass of {Term.__module__}.Term"
+    lacks = sorted(getattr(term, "__abstractmethods__", ()))
+    return f"{term.__name__} lacks {listed(lacks)}" if lacks else ""
+
+
+TERMS = Registry("tgdsl.terms", "term", "terms", _TERMS, _wrong, term_name)
+"""The terms that documents may name; packages bring others by the entry points `tgdsl.terms`."""
