@@ -60,6 +60,11 @@ BAD = {
     ),
     "several rows of a sum": (lambda a: a.update({"rows:touch": np.array("sum")}), r"found shape \(60, 3, 3\), expected \(60, 1, 3\)"),
     "neither each nor sum": (lambda a: a.update({"rows:touch": np.array("all")}), 'rows:touch: found "all"; expected "each" or "sum"'),
+    "a name twice": (
+        lambda a: a.update({"bodies": np.array(["ball", "pad", "ball"])}),
+        'bodies: "ball" stands there 2 times; expected each name once',
+    ),
+    "zeros alone": (lambda a: a.update({"target:touch": 0 * a["target:touch"]}), "target:touch: all its numbers are 0"),
     "no field": (lambda a: a.pop("body_quat"), "body_quat: this field is missing"),
     "no target": (lambda a: a.pop("target:touch"), "there is no target; expected target:<reading>, of touch"),
     "other times": (lambda a: a.update({"clock:touch": a["clock:touch"] + 100}), "found times from 100.52 to 102.72 s"),

@@ -172,7 +172,7 @@ class _Reader:
         wanted = [name for name in self.inputs.fields if name != "dt"]
         fields = {name: self._field(name, len(time)) for name in wanted if name in self.arrays}
         for name in wanted:
-            if name not in fields and DERIVED.get(name) not in self.arrays:
+            if name not in fields and DERIVED.get(name) not in {*self.arrays, *wanted}:
                 hint = "gate: geometric needs no contacts; " if name.startswith("contact_") else ""
                 self.note(name, "this field is missing", f"{hint}the module reads {', '.join(self.inputs.fields)}")
         widths = {name: self._width(name, value) for name, value in fields.items() if f"width:{name}" in self.arrays}
@@ -224,6 +224,8 @@ class _Reader:
         if key not in self.arrays:
             return value
         names = [str(name) for name in self.arrays[key]]
+        for twice in sorted(name for name in set(names) if names.count(name) > 1):
+            self.note(key, f'"{twice}" stands there {names.count(twice)} times', "expected each name once")
         for wanted in self.inputs.names[axis]:
             if wanted not in names:
                 self.note(key, f'"{wanted}" is missing', did_you_mean(wanted, names, "names"))
@@ -270,6 +272,8 @@ class _Reader:
             self.note(weight_key, "expected weights of at least 0")
         hint = f"leave the sample out, or set {weight_key} to 0 there"
         self.note_first(key, value, ~np.isfinite(value) & (weight > 0), ", {num} such numbers in all", hint)
+        if (weight > 0).any() and not (value[weight > 0] != 0.0).any():
+            self.note(key, "all its numbers are 0", "expected a recording of what the sensor reads under load")
         width = self._scalar(f"clock_width:{name}") or 0.0
         if len(steps) > 1 and (time[-1] < steps[0] - 5 * width or time[0] > steps[-1] + 5 * width):
             span = f"{time[0]:g} to {time[-1]:g} s, the states are from {steps[0]:g} to {steps[-1]:g} s"
