@@ -63,6 +63,7 @@ RAW = SourceKind("raw", 'a folder, "…/raw"', open_fingertip, recognise=lambda 
 OTHER = SourceKind("fingertip", '"fingertip"', open_fingertip)
 SIMULATION = SourceKind("simulation", '"simulation"', open_fingertip)
 SIMULATOR = SimulatorKind("mine", '"mine"', open_simulator, devices=("xpu",), simulate=simulate)
+PLAIN = SimulatorKind("plain", '"plain"', devices=("xpu",), simulate=simulate)
 NO_KIND = {"name": "fingertip"}
 '''
 OWN = [kind.name for kind in SOURCES]
@@ -141,6 +142,16 @@ def test_an_installed_simulator_is_taken_for_its_device(install, tmp_path):
         tgdsl.simulate(touch, 3, device="meta")
 
 
+def test_a_simulator_without_open_is_connected_by_what_it_simulates(install, tmp_path):
+    install("handy", "1.2", plain="handy:PLAIN")
+    touch = module(tmp_path)
+    with tgdsl.connect(touch, "plain", num_envs=2, layers=4) as env:
+        assert (env.num_envs, env.source.substeps) == (2, round(0.02 / env.source.model.opt.timestep))
+        assert env.observe().keys() == touch.observe(touch(touch.example_state(2))).keys()
+    with pytest.raises(TgdslError, match='"plain" has no option "gain"; known options: control_step, layers, num_envs, scene'):
+        tgdsl.connect(touch, "plain", gain=1)
+
+
 @pytest.mark.parametrize(
     ("point", "message"),
     [
@@ -199,8 +210,8 @@ def test_warp_is_connected_to_like_any_other_source(tmp_path):
 def test_warp_without_a_device_asks_for_cuda(tmp_path, monkeypatch):
     asked = {}
 
-    def started(self, touch, num_envs, **keys):
-        asked.update(keys)
+    def started(self, touch, num_envs, *, device=None, **keys):
+        asked["device"] = device
         raise SimulationError("no GPU here")
 
     monkeypatch.setattr(tgdsl.WarpSimulation, "__init__", started)

@@ -9,8 +9,8 @@ Installed packages bring further kinds of sources by an entry point, in their py
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, Unpack, overload
@@ -105,7 +105,9 @@ def connect(
     for option in options:
         if option not in kind.options:
             raise TgdslError(f'"{name}" has no option "{option}"; {did_you_mean(option, kind.options, "options")}')
-    return kind.open(touch, name, **{option: shared[option] for option in kind.options if option in shared}, **options)
+    opens = partial(_open_simulator, kind) if isinstance(kind, SimulatorKind) and kind.open is None else kind.open
+    assert opens is not None
+    return opens(touch, name, **{option: shared[option] for option in kind.options if option in shared}, **options)
 
 
 @overload
@@ -175,34 +177,25 @@ def simulator_for(device: str, name: str | None = None) -> SimulatorKind:
     return results[0]
 
 
-def _open_simulation(
-    touch: TactileModule, source: str, *, num_envs: int, control_step: float, keyframe: str | None, scene: _Scene = None
-) -> Connection:
-    options: SimOptions = {"keyframe": keyframe, "threads": 0 if num_envs > 1 else 1}
-    return _simulation(touch, control_step, scene, lambda: BatchSimulation(touch, num_envs, **options))
-
-
-def _open_warp(
+def _open_simulator(
+    kind: SimulatorKind,
     touch: TactileModule,
     source: str,
     *,
     num_envs: int,
     control_step: float,
-    keyframe: str | None,
     scene: _Scene = None,
-    nconmax: int | None = None,
-    njmax: int | None = None,
+    **options: Any,
 ) -> Connection:
-    device = source.partition(":")[2] or "cuda"
-    options: SimOptions = {"keyframe": keyframe, "nconmax": nconmax, "njmax": njmax}
-    return _simulation(touch, control_step, scene, lambda: WarpSimulation(touch, num_envs, device=device, **options))
-
-
-def _simulation(touch: TactileModule, control_step: float, scene: _Scene, make: Callable[[], Simulation]) -> Connection:
     for term in touch.plan.observations:
         if term.type in HAND_ONLY:
             raise hand_only_error(term.group, term.index, term.type)
-    return SimulationConnection(touch, _with_step(make(), control_step) if scene is None else _stepping(scene, control_step))
+    if scene is not None:
+        return SimulationConnection(touch, _stepping(scene, control_step))
+    options |= {"device": source.partition(":")[2] or kind.devices[0], "substeps": 1}
+    known = keyword_options(kind.simulate)
+    sim = kind.simulate(touch, num_envs, **{name: value for name, value in options.items() if name in known})
+    return SimulationConnection(touch, _with_step(sim, control_step))
 
 
 def _open_emulator(
@@ -276,14 +269,13 @@ SOURCES: tuple[SourceKind, ...] = (
     SimulatorKind(
         "simulation",
         '"simulation"',
-        _open_simulation,
         recognise=lambda source: source == "simulation",
         devices=("cpu",),
         simulate=BatchSimulation,
     ),
     SourceKind("emulator", '"emulator"', _open_emulator, recognise=lambda source: source == "emulator"),
     SourceKind("xhand1", '"xhand1", "xhand1:PORT"', _open_hand),
-    SimulatorKind("warp", '"warp", "warp:DEVICE"', _open_warp, devices=("cuda",), simulate=WarpSimulation),
+    SimulatorKind("warp", '"warp", "warp:DEVICE"', devices=("cuda",), simulate=WarpSimulation),
     SourceKind("log", 'the path of a log, "….npz"', _open_log, recognise=lambda source: source.endswith(".npz")),
 )
 """The kinds of tgdsl."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Float
@@ -183,8 +183,18 @@ class SourceKind:
 class SimulatorKind(SourceKind):
     """A kind of source that `tgdsl.simulate` can make too."""
 
+    #: default: the simulation that `simulate` makes, of a scene of its own or of a task
+    open: Callable[..., Connection] | None = field(default=None, kw_only=False)  # pyright: ignore[reportIncompatibleVariableOverride]
     devices: tuple[str, ...]  #: types of torch devices that it is the default simulator of: "cpu", "cuda"
     simulate: Callable[..., Any]  #: makes a simulation: `simulate(touch, num_envs, *, device, option, …)`
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Names of the options that it knows."""
+        if self.open is not None:
+            return keyword_options(self.open)
+        chosen = ("device", "substeps", "model")  # by the source, by `control_step` and by the module
+        return ("num_envs", "control_step", "scene", *(name for name in keyword_options(self.simulate) if name not in chosen))
 
 
 def keyword_options(call: Callable[..., Any]) -> tuple[str, ...]:

@@ -26,8 +26,8 @@ from tgdsl.rl.playing.evaluation import SEED, mean_interval, share_interval
 from tgdsl.rl.playing.policy import Policy
 from tgdsl.rl.playing.record import Record
 from tgdsl.rl.playing.rollout import Moment, rollout
-from tgdsl.runtime.connect import connect, kind_of
-from tgdsl.runtime.connection import Connection
+from tgdsl.runtime.connect import MUJOCO, connect, kind_of
+from tgdsl.runtime.connection import Connection, SimulatorKind
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.motion import MotionLimits
@@ -186,9 +186,10 @@ class Deployment:
         kind = kind_of(source)
         self.source, self.has_scene = source, "scene" in kind.options
         self._is_emulated, self._is_log = self.has_scene and "motion" in kind.options, kind.name == "log"
-        is_warp = kind.name == "warp"
-        self._env_options: dict[str, Any] = {"seed": seed, "simulator": "warp" if is_warp else "mujoco", "progress": progress}
-        self._env_options["device"] = device = source.partition(":")[2] or "cuda" if is_warp else "cpu"
+        simulator, device = MUJOCO, "cpu"
+        if isinstance(kind, SimulatorKind) and kind.name != "simulation":
+            simulator, device = kind.name, source.partition(":")[2] or kind.devices[0]
+        self._env_options = {"seed": seed, "simulator": simulator, "device": device, "progress": progress}
         self.prepared = prepared = prepare(
             task,
             Path(policy),

@@ -323,7 +323,7 @@ class BatchSimulation(Simulation):
         refuse_two_instants(model, f'{problem}; take <flag sleep="enable"/> out of its <option>')
         numbers = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION) + 16 * model.nbody + model.nsensordata
         refuse_beyond_memory(f"{num_envs} environments", 8 * numbers * num_envs)
-        self.batch = mujoco.batch.Batch(model, num_envs, options.get("threads", 0))
+        self.batch = mujoco.batch.Batch(model, num_envs, options.get("threads", 0) or int(num_envs == 1))
         self._keyframe, self._warnings = keyframe, StepWarnings()
         self._sensors = ContactSensors(model, inputs)
         with torch.inference_mode(False):
