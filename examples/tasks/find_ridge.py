@@ -1,20 +1,21 @@
-"""Slide a fingertip over a plate, and stop on a ridge whose place only touch tells: a task of one's own, to copy.
+"""Slide a fingertip over a plate and stop on a ridge that only touch can find: a task to copy.
 
-An episode begins with the fingertip just above the plate, at one of its ends; the ridge is further on, uniformly distributed.
-With p the middle of the pad and v its velocity, r the ridge's place, both across the ridge, and f the ridge's force on the
-fingertip, the fingertip
+An episode begins with the fingertip just above one end of the plate. The ridge is further on, at a uniformly random position.
+Let p be the middle of the pad and v its velocity, r the position of the ridge, all across the ridge, and f the ridge's force on
+the fingertip. The fingertip
 
     rests        |p − r| ≤ ε  and  |f| ≥ f_min  and  |v| ≤ v_max
 
-An episode ends when its time is over, and has gone well if the fingertip rests then. That is its end for good: nothing is
-worth anything later. Who knows nothing of the ridge does best at a fixed place, where it rests with a probability of at most
-2 ε / (b − a), r being uniform on [a, b]: `chance`.
+An episode ends when its time is over, and succeeds if the fingertip rests then. This end is terminal: no value follows it.
+A policy that knows nothing of the ridge does best at a fixed position, where it rests with a probability of at most
+2 ε / (b − a), with r uniform on [a, b]: `chance`.
 
-Groups: `command` holds the targets of the joints [rad], the last action and the share of the episode that is left, none of
-which knows of the ridge; `priv_ridge` p − r [m], v [m/s] and |f| [N]. Measured positions of the joints are in `proprio`; where
-they differ from the targets something is in the way, so a policy without touch must not have them.
+Groups: `command` has the targets of the joints [rad], the last action and the share of the episode that is left. None of them
+depends on the ridge. `priv_ridge` has p − r [m], v [m/s] and |f| [N]. `proprio` has measured joint positions; where they differ
+from the targets, something is in the way, so a policy without touch must not see them.
 
-Without touch all places within [a + ε, b − ε] pay the same, so nothing but chance can be learned. Score: whether it rests.
+Without touch all positions within [a + ε, b − ε] pay the same, so a policy can learn nothing but chance. Score: whether the
+fingertip rests.
 """
 
 from __future__ import annotations
@@ -39,27 +40,27 @@ ACROSS = 1
 
 
 class RidgeRandomSpec(RandomSpec):
-    """What is random."""
+    """Random values."""
 
     place: Annotated[Range, RangeOf("length")] = (-0.008, 0.016)
-    """a and b: where the ridge is, along the world's y [m]."""
+    """a and b: range of the ridge's position along the world's y [m]."""
 
 
 class FindRidgeSpec(TaskSpec):
-    """Stop on a ridge that can only be felt."""
+    """Stop on a ridge that only touch can find."""
 
     randomise: RidgeRandomSpec = RidgeRandomSpec()
-    """What is random."""
+    """Random values."""
     tip: str = "right_hand_index_rota_link2"
     """The body of the fingertip."""
     pad: Position = (0.009, 0.0, 0.032)
     """The middle of its pad, in its frame [m]."""
     tolerance: PositiveLength = 0.001
-    """ε: how far the ridge may be from the middle of the pad [m]."""
+    """ε: largest distance of the ridge from the middle of the pad [m]."""
     min_force: Annotated[float, Quantity("force", gt=0.0)] = 0.1
-    """f_min: less force of the ridge is no rest [N]."""
+    """f_min: least force of the ridge at rest [N]."""
     max_speed: Annotated[float, Quantity("speed", gt=0.0)] = 0.01
-    """v_max: faster is no rest [m/s]."""
+    """v_max: largest speed at rest [m/s]."""
 
 
 def chance(spec: FindRidgeSpec) -> float:
@@ -125,10 +126,10 @@ class FindRidge(Task[FindRidgeSpec]):
     action_rate = terms.ActionRate.of_task(-1e-3)
 
     def __init__(self, spec: FindRidgeSpec, setup: Setup):
-        """Begin with the ridge where the scene has it.
+        """Start with the ridge at its position in the scene.
 
         Raises:
-            SimulationError: If the ridge is no mocap body, and so cannot be put elsewhere.
+            SimulationError: If the ridge is not a mocap body, and so cannot be moved.
         """
         super().__init__(spec, setup)
         model = setup.model
@@ -143,47 +144,47 @@ class FindRidge(Task[FindRidgeSpec]):
 
     @classmethod
     def watch(cls, spec: FindRidgeSpec) -> Watch:
-        """The fingertip is looked at."""
+        """Watch the fingertip."""
         return Watch(bodies=(spec.tip,))
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
-        """Put ridges elsewhere."""
+        """Draw new positions of the ridges."""
         pos = self.mocap.repeat(self.setup.num_envs, 1, 1)
         pos[:, self.ridge, ACROSS] = self.setup.draws.uniform("place", episode, 1, *self.spec.randomise.place)[:, 0].to(pos)
         self.begin(chosen, elapsed=0.0, rests=0.0)
         return Start({"mocap_pos": pos})
 
     def advance(self, now: Now) -> None:
-        """Look at whether the fingertip rests on the ridge."""
+        """Update whether the fingertip rests on the ridge."""
         offset, speed, force = self._motion(now).unbind(dim=1)
         is_pressed = (force >= self.spec.min_force) & (speed.abs() <= self.spec.max_speed)
         self.rests.copy_(is_pressed & (offset.abs() <= self.spec.tolerance))
         self.elapsed += 1.0
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
-        """Return where time is over."""
+        """Return the environments whose time is over."""
         return self.elapsed >= self.num_steps
 
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return what was commanded, and what is privileged of the ridge."""
+        """Return the command, and the privileged state of the ridge."""
         left = 1.0 - self.elapsed / self.num_steps
         return {"command": command(now, left), "priv_ridge": self._motion(now)}
 
     @classmethod
     def observe_hand(cls, spec: FindRidgeSpec, now: HandNow) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return what was commanded."""
+        """Return the command."""
         left = 1.0 - now.steps / max(1, round(spec.episode / now.control_step))
         return {"command": command(now, torch.full((len(now.target),), left, dtype=now.target.dtype))}
 
     def score(self) -> Float[Tensor, " env"]:
-        """Return whether it rests."""
+        """Return whether the fingertip rests."""
         return self.rests.to(self.setup.dtype)
 
     def script(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
-        """Return the actions of a policy written by hand, for clean `depth` at `low`: slide, and centre what is felt.
+        """Return the actions of a scripted policy for clean `depth` at `low`: slide, then centre the ridge under the pad.
 
-        Three rows of taxels run along the finger. On the plate both outer ones reach into it; on the ridge, which lifts the
-        finger, only that on its side.
+        Three rows of taxels run along the finger. On the plate both outer rows have depth. The ridge lifts the finger, and then
+        only the row on its side has depth.
         """
         target, depth = obs["command"][:, :2], obs["tactile_sensors"].view(-1, 3, 3)
         low, _, high = (1e3 * depth.sum(dim=2)).unbind(dim=1)  # [mm]

@@ -114,7 +114,7 @@ class PushSpec(SpecModel):
 
 
 class RandomSpec(SpecModel):
-    """What is random, drawn at each reset; what is left out is not."""
+    """Values that are drawn at each reset; a key that is left out is not random."""
 
     friction: Factor = ONE
     """Factor on the object's coefficient of sliding friction."""
@@ -189,7 +189,7 @@ class TaskSpec(SpecModel):
     action: ActionSpec = ActionSpec()
     """How an action is understood."""
     randomise: RandomSpec = RandomSpec()
-    """What is random at each reset."""
+    """Values that are drawn at each reset."""
     terms: dict[str, dict[str, Any]] = {}
     """Terms of reward, reasons to end and groups of observations that are added to the task's: see `tgdsl.rl.terms`."""
     train: TrainSpec = TrainSpec()

@@ -168,7 +168,7 @@ class Deployment:
                 `tactile_sensors` and `goal`, of those that there are.
             goal: What it is asked for, in the task's units; default: what the scene's task asks for.
             overrides: Values of the document to set first by dotted path.
-            seed: What is random in a scene follows from it: episode i is the first one of environment i of `tgdsl evaluate`.
+            seed: Seed of the scene's random numbers: episode i is the first one of environment i of `tgdsl evaluate`.
             start: Keyframe whose controls a hand without a scene begins with; default: it holds the joints where they are.
             calibration: What a hand's counts mean: see `tgdsl.connect`.
             motion: Leave for a real hand to move, or what makes it of the scene's model; default: none. An emulated one always

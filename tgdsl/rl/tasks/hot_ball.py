@@ -42,7 +42,7 @@ from tgdsl.rl.task import Features, Now, Part, Setup, Start, reward_term
 
 
 class HotBallRandomSpec(RandomSpec):
-    """What is random."""
+    """Random values."""
 
     xy: Annotated[Range, RangeOf("length")] = (0.0, 0.0)
     """What is added to each ball's place along the world's x and y, each [m]."""
@@ -61,7 +61,7 @@ class HotBallSpec(TaskSpec):
     others: tuple[str, ...] = ()
     """Bodies of the other balls: each may be where the keyframe has another one, or the hot one."""
     randomise: HotBallRandomSpec = HotBallRandomSpec()
-    """What is random."""
+    """Random values."""
     ambient: Temperature = 22.0
     """T_a, temperature of the surroundings, as the sensors' document has it [°C]."""
     target: Temperature = 45.0

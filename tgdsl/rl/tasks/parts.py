@@ -97,7 +97,7 @@ class PlacedTaskSpec(TaskSpec):
     """A task whose object is put down freely, and has an orientation as its goal."""
 
     randomise: PlacedRandomSpec = PlacedRandomSpec()
-    """What is random."""
+    """Random values."""
     goal: Annotated[tuple[GoalPart, ...], Field(min_length=1)] = ("orientation", "angle")
     """What the group `goal` has, in order: six numbers of the goal's `orientation`; the same of the `difference`, the turn from
     the object to the goal in world axes; the `angle` of that turn [rad]."""
