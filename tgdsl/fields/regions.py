@@ -88,12 +88,11 @@ _TaggedRegion = Annotated[
 ]
 
 
-def _as_list(value: object) -> object:
-    return (value,) if isinstance(value, dict) else value
-
-
 Region = Annotated[
     tuple[_TaggedRegion, ...],
-    BeforeValidator(_as_list, json_schema_input_type=_TaggedRegion | tuple[_TaggedRegion, ...]),
+    BeforeValidator(
+        lambda value: (value,) if isinstance(value, dict) else value,
+        json_schema_input_type=_TaggedRegion | tuple[_TaggedRegion, ...],
+    ),
 ]
 """A region, or a list of regions that means their intersection; an empty one means all of the surface."""

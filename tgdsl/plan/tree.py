@@ -84,7 +84,7 @@ def restored(kind: Any, plain: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     origin = get_origin(kind) or kind
     if plain is None:
         return None
-    if isinstance(kind, TypeVar) or _is_array(origin):
+    if isinstance(kind, TypeVar) or origin is np.ndarray or hasattr(origin, "array_type"):
         return arrays[plain[LEAF]]
     if origin in (Union, types.UnionType):
         kinds = [part for part in get_args(kind) if part is not type(None)]
@@ -106,10 +106,6 @@ def restored(kind: Any, plain: Any, arrays: Mapping[str, np.ndarray]) -> Any:
 
 def _is_record(value: Any) -> bool:
     return dataclasses.is_dataclass(value) and not isinstance(value, type)
-
-
-def _is_array(origin: Any) -> bool:
-    return origin is np.ndarray or hasattr(origin, "array_type")
 
 
 def _fields(kind: Any) -> set[str]:

@@ -114,27 +114,24 @@ class TemperaturePerEnv(SpecModel):
     """Initial value in all environments [°C]."""
 
 
-def _is_per_env(value: Any) -> str:
-    return "per environment" if isinstance(value, (dict, TemperaturePerEnv)) else "the same in all"
-
-
 def _not_bare(value: Any) -> Any:
     if value == "per_env":
         raise ValueError("found `per_env` alone, expected `{per_env: 45 degC}`, the temperature to begin with")
     return value
 
 
-def _as_tuple(value: Any) -> Any:
-    return value if isinstance(value, (list, tuple)) else (value,)
-
-
 ObjectTemperature = Annotated[
     Annotated[Temperature, Tag("the same in all")] | Annotated[TemperaturePerEnv, Tag("per environment")],
-    Discriminator(_is_per_env),
+    Discriminator(lambda value: "per environment" if isinstance(value, (dict, TemperaturePerEnv)) else "the same in all"),
     BeforeValidator(_not_bare),
 ]
 _Materials = Annotated[tuple[MaterialField, ...], Field(min_length=1)]
-ObjectMaterials = Annotated[_Materials, BeforeValidator(_as_tuple, json_schema_input_type=MaterialField | _Materials)]
+ObjectMaterials = Annotated[
+    _Materials,
+    BeforeValidator(
+        lambda value: value if isinstance(value, (list, tuple)) else (value,), json_schema_input_type=MaterialField | _Materials
+    ),
+]
 Cells = Annotated[StrictInt, Field(ge=1)]
 Bits = Annotated[StrictInt, Field(ge=0, lt=2**31)]
 

@@ -208,7 +208,8 @@ class Screwdriver(terms.HandTask[ScrewdriverSpec]):
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
         """Return where the screwdriver has fallen over, its tip is out of the screw, or it has stalled."""
-        is_lost = (self.tilt > self.spec.drop_tilt) | (self._tip_distance(now) > self.spec.engagement)
+        tip_distance = (now.watched.site_pos[:, 0] - self.upright_tip).norm(dim=1)
+        is_lost = (self.tilt > self.spec.drop_tilt) | (tip_distance > self.spec.engagement)
         stall = self.spec.stall
         return is_lost | (self.since >= round(stall.within / self.setup.control_step)) if stall else is_lost
 
@@ -228,9 +229,6 @@ class Screwdriver(terms.HandTask[ScrewdriverSpec]):
         if self.holding.pays_in_full:
             return torch.ones_like(self.rate)
         return torch.where(self.rate > 0, self.holding.pay(now), 1.0)
-
-    def _tip_distance(self, now: Now) -> Float[Tensor, " env"]:
-        return (now.watched.site_pos[:, 0] - self.upright_tip).norm(dim=1)
 
 
 def _upright(setup: Setup, tip: str) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:

@@ -20,7 +20,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatchcase
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -52,19 +52,14 @@ class ModeSpec(SpecModel):
     """Amplitude of what is heard per impulse, g [1/kg]."""
 
 
-def _as_shape(found: Any) -> Any:
-    return {"material": found} if isinstance(found, str) else found
-
-
-def _tag(value: Any) -> str:
-    return "a list of modes" if isinstance(value, (list, tuple)) else "of the shape"
-
-
 ListedModes = Annotated[tuple[ModeSpec, ...], Field(min_length=1)]
 ModesField = Annotated[
     Annotated[ListedModes, Tag("a list of modes")] | Annotated[ShapeModes, Tag("of the shape")],
-    Discriminator(_tag),
-    BeforeValidator(_as_shape, json_schema_input_type=str | ListedModes | ShapeModes),
+    Discriminator(lambda value: "a list of modes" if isinstance(value, (list, tuple)) else "of the shape"),
+    BeforeValidator(
+        lambda found: {"material": found} if isinstance(found, str) else found,
+        json_schema_input_type=str | ListedModes | ShapeModes,
+    ),
 ]
 """What a user may write for the modes of a body: a list of them, `{material: steel, …}` for those of its shape, or `steel`."""
 

@@ -113,6 +113,7 @@ def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> L
     constants |= {
         f"is_{name}": scalar(1.0) for name in (spec.scheme, spec.model) if name in ("spectral", "semi_implicit", "paper")
     }
+    is_stiff = all(own.youngs_modulus is not None for own in made_of)
     reports, report_rows = {"heat": HEAT}, {}
     if spec.feels:
         reports["objects"], report_rows["objects"] = OBJECTS, Axis("object", len(spec.feels), {"object": spec.feels})
@@ -126,7 +127,7 @@ def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> L
                 slots=spec.slots,
                 boxes=boxes,
                 is_star=spec.model == "paper",
-                needs_stiffness=_needs_stiffness(spec, made_of),
+                needs_stiffness=spec.contact_area == "manifold" and not is_stiff,
             ),
         ),
         rows=rows,
@@ -157,10 +158,6 @@ def _films(
 
 def _radiated(spec: TemperatureGridSpec, made_of: list[Material]) -> Float[np.ndarray, " row"]:
     return 4.0 * stefan_boltzmann() * _emissivities(spec, made_of) * (spec.ambient + zero_celsius()) ** 3
-
-
-def _needs_stiffness(spec: TemperatureGridSpec, made_of: list[Material]) -> bool:
-    return spec.contact_area == "manifold" and any(own.youngs_modulus is None for own in made_of)
 
 
 def _contact(spec: TemperatureGridSpec, made_of: list[Material], size: np.ndarray) -> dict[str, np.ndarray]:

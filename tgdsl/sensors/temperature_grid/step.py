@@ -54,7 +54,7 @@ def step(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, consta
         constants: What `lower` folded.
         dt: Δt [s].
     """
-    inverse = _of_nodes(patches, _inverse(patches))
+    inverse = _of_nodes(patches, 1.0 / (patches.objects.volumetric_heat * patches.objects.volume))
     gained, nodes_gained = torch.zeros_like(cells), torch.zeros_like(nodes)
     # Sums, and no views of what the module overwrites: derivatives are taken of them later.
     cells, nodes = cells + gained, nodes + nodes_gained
@@ -175,10 +175,6 @@ def diffused(cells: Tensor, rows: Rows, constants: Constants, dt: Tensor) -> dif
 
 def _exponents(rows: Rows, dt: Tensor) -> Tensor:
     return diffusion.exponents([dt * rate for rate in rows.rates], rows.modes)
-
-
-def _inverse(patches: ContactPatch) -> Tensor:
-    return 1.0 / (patches.objects.volumetric_heat * patches.objects.volume)
 
 
 def _joules(gained: Tensor, inverse: Tensor) -> Tensor:
