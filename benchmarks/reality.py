@@ -171,9 +171,9 @@ def gelsight(data: Path, out: Path | None, only: str, starts: int) -> None:
             ("gaussian, drag, offset", {**GAUSSIAN, "dilation_strength": 0}, [drag], ["skin.shear_falloff=1e4:1e6"], "offset"),
             ("half_space, drag, offset", {**HALF_SPACE, "friction": 0.3}, [drag], [*OF_HALF_SPACE, FRICTION], "offset"),
             ("layer, drag, offset", {**LAYER, "friction": 0.3}, [drag], [*OF_LAYER, FRICTION], "offset"),
-            ("press's layer, drag, offset", {**PRESSED, "friction": 0.6}, [drag], [FRICTION], "offset"),
+            ("press's layer, drag, offset", {**PRESSED, "friction": 0.15}, [drag], [FRICTION], "offset"),
             ("half_space, raw drag, offset", {**HALF_SPACE, "friction": 0.3}, [raw], [*OF_HALF_SPACE, FRICTION], "offset"),
-            ("layer, both, offset", {**PRESSED, "friction": 0.6}, [press, drag], [*OF_LAYER, FRICTION], "offset"),
+            ("layer, both, offset", {**PRESSED, "friction": 0.15}, [press, drag], [*OF_LAYER, FRICTION], "offset"),
         ]  # fmt: skip
         normals, fits = np.tile([0.0, 0.0, 1.0], (len(places), 1)), dict[str, Fit]()
         for label, skin, recordings, fit, reading in cases:
@@ -272,11 +272,11 @@ def eflesh(data: Path, out: Path | None, only: str, starts: int) -> None:
     loop, of_loop = {"force": 1.5, "width": 2e-3}, ["load.loop.force=0.1:10", "load.loop.width=0.1 mm:10 mm"]
     closing = "load.densification=21 mm:500 mm"
     normal, shear = eflesh_recording(data, "normal", 0.75e-3, 2), eflesh_recording(data, "shear", 4e-3, 12)
-    halves = [eflesh_recording(data, "normal", 0.75e-3, 4, part) for part in (slice(0, 5), slice(5, 10))]
+    parts = [eflesh_recording(data, "normal", 0.75e-3, 4, part) for part in (slice(0, 1), slice(1, 5), slice(5, 10))]
     cases = {
         "normal, power law": ({}, [normal], [stiffness, exponent], False),
         "normal, power law, damping": ({}, [normal], [stiffness, exponent, "load.normal_damping=0:1e6"], False),
-        "normal, power law, gain of each half": ({}, halves, [exponent], True),
+        "normal, power law, gain of first press, presses 2 to 5, rest": ({}, parts, [exponent], True),
         "shear, power law": ({}, [shear], [stiffness, exponent], False),
         "shear, loop": ({"loop": loop}, [shear], [stiffness, exponent, *of_loop], False),
         "shear, loop, densification": ({"loop": loop, **lattice}, [shear], [stiffness, exponent, *of_loop, closing], False),

@@ -4,7 +4,7 @@
 
 Kinds without a case: `contact` and `link_contact` read bits, which no derivative reaches; `contact_depth` and
 `surface_distance` have no parameter that changes their number; the scraping of `contact_audio` is a random sound. A fit of
-`temperature_grid` or `microphone` takes minutes, step by step. `proximity` is not tried.
+`microphone` takes minutes, step by step. `proximity` is not tried. A block that cools, of `temperature_grid`, has a closed form.
 """
 
 import json
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
-from scipy import stats
+from scipy import optimize, stats
 
 import tgdsl
 from tgdsl.calibration.recordings import NAMES_OF, velocities
@@ -190,6 +190,42 @@ def test_what_no_reading_tells_apart_is_named(tmp_path, name):
     for seed in range(3):
         fit = tgdsl.calibrate(path, recording(path, case, seed), list(case.untold), starts=1, intervals="none")
         assert any(all(name in text for name in case.untold) for text in fit.warnings), fit.warnings
+
+
+def cooling(path: Path) -> Path:
+    """Write an aluminium cube of 24 mm at 60 °C in air of 22 °C, one cell without radiation."""
+    path.with_name("scene.xml").write_text(SCENE.replace(".02 .02 .01", ".012 .012 .012"))
+    sensor = {"kind": "temperature_grid", "links": "pad", "feels": ["ball"], "cells": [1, 1, 1], "material": "aluminium"}
+    sensor |= {"temperature": "60 degC", "emissivity": 0, "convection": 15, "outputs": "mean"}
+    objects = {"ball": {"body": "ball", "material": "steel"}}
+    content = {"tgdsl": 1, "robot": {"model": "scene.xml"}, "objects": objects, "sensors": {"touch": sensor}}
+    path.write_text(json.dumps(content))
+    return path
+
+
+@pytest.mark.slow
+def test_convection_and_its_interval_are_those_of_the_closed_form(tmp_path):
+    """T = T_a + (T_0 − T_a) exp(−U A t / C), U = 1 / (1/h + Δ/2k): least squares with Student's interval of one parameter."""
+    path, true, num = cooling(tmp_path / "touch.yaml"), 20.0, 13
+    edge, (conductivity, density, heat) = 0.024, (237.0, 2702.0, 903.0)  # Incropera
+    time = 20.0 * np.arange(num)
+
+    def temperature(film: float) -> np.ndarray:
+        rate = 6.0 / (edge * density * heat) / (1.0 / film + edge / (2.0 * conductivity))
+        return 22.0 + 38.0 * np.exp(-rate * time)
+
+    read = temperature(true) + np.random.default_rng(0).normal(0.0, 0.5, num)
+    inputs = tgdsl.compile(path).inputs
+    fields = [name for name in inputs.fields if name != "dt"]
+    still = {name: np.zeros((num, *(inputs.sizes.get(axis, axis) for axis in SHAPES[name]))) for name in fields}
+    still["body_quat"][..., 0] = 1.0
+    of_target = {"target:touch": read[:, None, None], "clock:touch": time, "unit:touch": "degC"}
+    fit = tgdsl.calibrate(path, {"time": time, **still, **of_target}, ["touch.convection=5:80"], starts=1)
+    found = optimize.least_squares(lambda film: temperature(film[0]) - read, [15.0])
+    error = np.sqrt((found.fun**2).sum() / (num - 1) / (found.jac**2).sum())
+    convection, half = fit.parameters["touch.convection"], stats.t.ppf(0.975, num - 1) * error
+    assert convection.value == pytest.approx(found.x[0], rel=2e-3)
+    assert (convection.low, convection.high) == pytest.approx((found.x[0] - half, found.x[0] + half), rel=5e-3)
 
 
 if __name__ == "__main__":
