@@ -106,7 +106,6 @@ def connect(
         if option not in kind.options:
             raise TgdslError(f'"{name}" has no option "{option}"; {did_you_mean(option, kind.options, "options")}')
     opens = partial(_open_simulator, kind) if isinstance(kind, SimulatorKind) and kind.open is None else kind.open
-    assert opens is not None
     return opens(touch, name, **{option: shared[option] for option in kind.options if option in shared}, **options)
 
 

@@ -184,7 +184,7 @@ class SimulatorKind(SourceKind):
     """A kind of source that `tgdsl.simulate` can make too."""
 
     #: default: the simulation that `simulate` makes, of a scene of its own or of a task
-    open: Callable[..., Connection] | None = field(default=None, kw_only=False)  # pyright: ignore[reportIncompatibleVariableOverride]
+    open: Any = field(default=None, kw_only=False)
     devices: tuple[str, ...]  #: types of torch devices that it is the default simulator of: "cpu", "cuda"
     simulate: Callable[..., Any]  #: makes a simulation: `simulate(touch, num_envs, *, device, option, …)`
 
