@@ -228,3 +228,12 @@ def test_an_obj_file_of_several_objects_is_read_whole(tmp_path, mark):
         )
     assert abs((touch.plan.layout.pos[:, 0] > 0.015).mean() - 0.5) < 0.1
     assert scene_model(touch.plan.scene).mesh_facenum.tolist() == [24]
+
+
+def test_a_file_of_mjcf_whose_name_is_in_another_case_is_named(tmp_path):
+    small().export(tmp_path / "finger.stl")
+    body = '<body name="a"><geom type="mesh" mesh="m"/></body>'
+    text = f'<mujoco><asset><mesh name="m" file="Finger.STL"/></asset><worldbody>{body}</worldbody></mujoco>'
+    (tmp_path / "hand.xml").write_text(text)
+    with pytest.raises(RobotError, match=r"hand\.xml: .*'Finger\.STL'; there is finger\.stl$"):
+        load_model(tmp_path / "hand.xml").bodies  # noqa: B018

@@ -10,6 +10,7 @@ and its unit, which most URDF loaders apply, is applied.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,12 @@ def put_in_line(mesh: mujoco.MjsMesh, file: Path) -> None:
     mesh.uservert, mesh.userface = vertices.ravel(), faces.ravel()
     if np.linalg.matrix_rank(vertices - vertices[0], tol=1e-6 * np.ptp(vertices)) < 3:
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+
+
+def in_other_case(files: Iterable[Path]) -> str:
+    """Return the end of a message on missing files, which names a file whose name differs in case alone; empty if none does."""
+    alike = [other.name for file in files for other in file.parent.glob("*") if other.name.lower() == file.name.lower()]
+    return f"; there is {alike[0]}" if alike else ""
 
 
 def refuse_unreadable(model_file: Path, spec: mujoco.MjSpec) -> None:

@@ -13,7 +13,7 @@ import mujoco
 
 from tgdsl.errors import listed
 from tgdsl.files.write import atomic_write_all
-from tgdsl.formats.mesh_files import refuse_unreadable
+from tgdsl.formats.mesh_files import in_other_case, refuse_unreadable
 from tgdsl.formats.model import Model
 from tgdsl.scene.scene import num_objects, readable
 
@@ -28,7 +28,11 @@ def read_mjcf(path: Path) -> Model:
     spec = mujoco.MjSpec.from_file(str(path))
     refuse_unreadable(path, spec)
     rewritten = rewrite_meshes(spec)
-    compiled = spec.copy().compile()  # of which the spec remembers nothing, such as hulls that other geoms do not need
+    try:
+        compiled = spec.copy().compile()  # of which the spec remembers nothing, such as hulls that other geoms do not need
+    except ValueError as error:
+        files = [Path(spec.modelfiledir, spec.meshdir, mesh.file) for mesh in spec.meshes if mesh.file]
+        raise ValueError(f"{error}{in_other_case(file for file in files if not file.is_file())}") from error
     return Model(path, spec, compiled, is_rounded=False, rewritten=rewritten)
 
 

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from tgdsl.errors import RobotError, listed
-from tgdsl.formats.mesh_files import BY_MUJOCO, BY_TRIMESH, Y_UP, put_in_line
+from tgdsl.formats.mesh_files import BY_MUJOCO, BY_TRIMESH, Y_UP, in_other_case, put_in_line
 from tgdsl.formats.mjcf import mjcf_of, rewrite_meshes
 from tgdsl.formats.model import LEAST_INERTIA, Model
 
@@ -178,8 +178,7 @@ def _mesh_file(name: str, urdf: Path) -> Path:
     for file in files:
         if file.is_file():
             return file
-    alike = [other.name for file in files for other in file.parent.glob("*") if other.name.lower() == file.name.lower()]
-    raise RobotError(f'{urdf}: mesh "{name}": {problem}' + (f"; there is {alike[0]}" if alike else ""))
+    raise RobotError(f'{urdf}: mesh "{name}": {problem}{in_other_case(files)}')
 
 
 def _package_name(folder: Path) -> str | None:
