@@ -49,6 +49,13 @@ def here(monkeypatch, capsys):
     return run
 
 
+@pytest.fixture
+def no_onnx(monkeypatch):
+    """Write an empty file for each ONNX policy, whose export takes a second; rl/playing/test_onnx_policy.py tests that."""
+    for writer in ("train.learner", "students.results"):
+        monkeypatch.setattr(f"tgdsl.rl.{writer}.write_onnx_policy", lambda network, texts, file: file.touch())
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the suite that kinds inherit, which has no marks: other people's pytest would not know them."""

@@ -6,7 +6,7 @@ import pytest
 import small_tasks
 from small_runs import ARGUMENTS
 
-pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+pytestmark = [pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning"), pytest.mark.usefixtures("no_onnx")]
 ON = ("--device", "cpu", "--envs", "4", "--iterations")
 FEW = tuple(
     word

@@ -20,7 +20,7 @@ from tgdsl.rl.playing.stage import LearnerStage
 from tgdsl.rl.train.folder import RunFolder, read_checkpoint
 from tgdsl.rl.train.learner import Learner
 
-pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+pytestmark = [pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning"), pytest.mark.usefixtures("no_onnx")]
 ON = ["--device", "cpu", "--envs", "4"]
 
 

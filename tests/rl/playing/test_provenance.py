@@ -13,7 +13,7 @@ from tgdsl.rl.load import load_task
 from tgdsl.rl.playing.policy import SCENE, changes_around, policy_for, provenance, read_policy
 from tgdsl.rl.train.folder import run_origin
 
-pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+pytestmark = [pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning"), pytest.mark.usefixtures("no_onnx")]
 IN_SCENE = [
     ("gravity", '<option timestep="0.005"', '<option timestep="0.005" gravity="0 0 -9.8"'),
     ("bodies", 'mass=".02"', 'mass=".021"'),

@@ -10,7 +10,7 @@ from small_runs import small_learner
 from tgdsl.rl.playing.policy import PolicyError, policy_for, read_policy
 from tgdsl.rl.train.folder import run_origin
 
-pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+pytestmark = [pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning"), pytest.mark.usefixtures("no_onnx")]
 
 
 def test_sensors_that_environments_lack_are_not_compared(tmp_path):
