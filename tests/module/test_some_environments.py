@@ -148,7 +148,7 @@ def test_compiled_equals_eager(folder):
 @pytest.mark.parametrize(("keeps_last", "num_graphs"), [(False, 3), (True, 2)])
 def test_who_keeps_what_is_handed_out_from_the_start_compiles_calls_once(folder, keeps_last, num_graphs):
     """One graph of calls and one of masked ones; else calls before the first masked one have a graph of their own."""
-    touch = tgdsl.compile(document(folder, {"d": {"kind": "contact_depth"}, "c": {"kind": "contact", "history": 3}}))
+    touch = tgdsl.compile(document(folder, {"d": {"kind": "contact_depth"}}))
     eager, compiled = copy.deepcopy(touch), []
     touch.memory.keeps_last = keeps_last
     touch.compile(backend=lambda graph, _: compiled.append(graph) or graph)

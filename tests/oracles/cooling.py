@@ -43,7 +43,7 @@ def transmitted(h: float, axes: str = "xyz") -> float:
 )  # fmt: skip
 def newton(dtype: torch.dtype = torch.float64):
     times = np.array([10.0, 50.0, 100.0])
-    ours = [cooled(0.5, t, dtype, convection=50.0) for t in times]
+    ours = [cooled(2.5, t, dtype, convection=50.0) for t in times]
     paper = 22 + 78 * np.exp(-50.0 * times / (HEAT / (SIDES[0] * SIDES[1] * SIDES[2])))
     rtol = 1e-12 if dtype == torch.float64 else 1e-6
     return Values(22 + 78 * np.exp(-transmitted(50.0) * times / HEAT), ours, paper, at=times, rtol=rtol)
@@ -67,7 +67,7 @@ def radiation(seconds: float = 2000.0):
     def elapsed(hot: float) -> float:
         return float(np.log((hot + around) / (hot - around)) + 2 * np.arctan(hot / around))
 
-    left = cooled(1.0, seconds, emissivity=0.85)
+    left = cooled(20.0, seconds, emissivity=0.85)
     factor = HEAT / (4 * 0.85 * stefan_boltzmann() * AREA * around**3)
     return Values(seconds, factor * (elapsed(left + zero_celsius()) - elapsed(100.0 + zero_celsius())), at=[f"{left:.1f} °C"])
 
@@ -83,7 +83,7 @@ def both_losses(seconds: float = 600.0):
         return -AREA / HEAT * (20.0 * (hot - around) + 0.5 * stefan_boltzmann() * (hot**4 - around**4))
 
     solution = solve_ivp(slope, (0, seconds), [100.0 + zero_celsius()], rtol=1e-10, atol=1e-10)
-    return float(solution.y[0, -1]) - zero_celsius() - 22, cooled(0.5, seconds, emissivity=0.5, convection=20.0) - 22
+    return float(solution.y[0, -1]) - zero_celsius() - 22, cooled(10.0, seconds, emissivity=0.5, convection=20.0) - 22
 
 
 @oracle(
@@ -153,7 +153,7 @@ def cube(num: int, material: str, steps: int = 60):
 
 @oracle(
     "A flux through a slab, to air, Δt = {dt:g} s", "ΔT = q (1/h + (L − x)/k)", "Incropera 3.1, resistances in series",
-    "rise of temperature [K]", "depth [m]", rtol=1e-3, defects=(11,), each=[1.0, 20.0],
+    "rise of temperature [K]", "depth [m]", rtol=1e-3, defects=(11,), each=[5.0, 20.0],
 )  # fmt: skip
 def flux_through(dt: float):
     flux, h, thick, num, k = 3000.0, 1000.0, 0.02, 20, ALUMINIUM.conductivity
@@ -166,7 +166,7 @@ def flux_through(dt: float):
 
 @oracle(
     "A flux through a slab that radiates, Δt = {dt:g} s", "q = εσ(T_s⁴ − T_a⁴), ΔT = T_s − T_a + q (L − x)/k",
-    "Stefan and Boltzmann's law, Incropera 3.1", "rise of temperature [K]", "depth [m]", defects=(11,), each=[5.0], also=[50.0],
+    "Stefan and Boltzmann's law, Incropera 3.1", "rise of temperature [K]", "depth [m]", defects=(11,), each=[25.0], also=[50.0],
 )  # fmt: skip
 def flux_radiated(dt: float):
     flux, thick, num, k, around = 400.0, 0.01, 4, MATERIALS["rubber"].conductivity, 22.0 + zero_celsius()

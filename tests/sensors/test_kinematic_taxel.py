@@ -297,14 +297,6 @@ def test_a_sliding_cube_that_is_balanced_drags_no_harder_than_the_solver(tmp_pat
     assert (force[sizes > 1e-6, 0] > 0).all()
 
 
-@pytest.mark.parametrize("alpha", [1.0, 1.5])
-def test_a_ball_on_a_dense_pad_is_on_a_winkler_foundation(alpha):
-    """Force against depth δ of a ball: a power of α + 1 where Hertz has 1.5."""
-    exponents = kinematic.winkler_exponent(alpha)
-    # No power of the depth is that of a half-space: 1.5 would take α of a half.
-    assert (np.abs(exponents.ours - 1.5) > 0.4).all()
-
-
 @pytest.mark.parametrize("exponent", [0.7, 1.0, 1.2])
 @pytest.mark.parametrize("depth", [0.0, 1e-12, -1e-3, -1.0])
 def test_gradients_are_finite_at_first_touch_and_far_away(tmp_path, exponent, depth):

@@ -90,6 +90,11 @@ def _plan_of(document: str, kinds: tuple[Kind, ...]) -> Plan:
         return compile_document(json.loads(document), kinds=kinds).plan
 
 
+@functools.lru_cache(maxsize=8)
+def _specs_of(document: str, kinds: tuple[Kind, ...]) -> Mapping[str, Any]:
+    return load(json.loads(document), kinds=(*KINDS, *kinds)).spec.sensors
+
+
 class KindConformance:
     """Inherit this in a test class and set `kind`, and `parameters` if its defaults are not what should be tested."""
 
@@ -141,7 +146,7 @@ class KindConformance:
 
     def reference(self, plan: Plan, document: dict[str, Any]) -> ReferenceModule:
         """Return a document's reference."""
-        specs = load(document, kinds=self._known()).spec.sensors
+        specs = _specs_of(json.dumps(document), self._extra())
         others = {name: (kind, specs[name]) for name, (kind, _) in self.others.items()}
         return KnownReference(answers_of(type(self), json.dumps(document)), plan, self.kind, specs["s"], others)
 

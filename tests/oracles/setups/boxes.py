@@ -3,7 +3,6 @@
 Shapes: `env` environments, `link` links, `x`, `y`, `z` cells.
 """
 
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from oracles.setups.scenes import folder
-from tgdsl.errors import CoarseCellsWarning
+from oracles.setups.scenes import compiled, folder
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
-from tgdsl.tuning.compile import compile
 
 Contact = tuple[Sequence[Any], Sequence[Any], float | int]
 """A point [m], a normal out of the object, and a normal force [N]."""
@@ -41,9 +38,7 @@ def heat_module(
         "objects": {name: {"body": name, **said} for name, (_, said) in objects.items()},
         "sensors": {"heat": {"kind": "temperature_grid", "links": list(links), "feels": list(objects), **sensor}},
     }
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CoarseCellsWarning)  # some cases are about coarse cells
-        return compile(document, dtype=dtype)
+    return compiled(document, dtype)
 
 
 def heat_state(

@@ -3,6 +3,8 @@
 Shapes: `env` environments, `taxel` taxels, `slot` contacts of a pair.
 """
 
+import functools
+import json
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -15,15 +17,17 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from tgdsl.errors import UnfeltWarning
+from tgdsl.errors import CoarseCellsWarning, UnfeltWarning
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
+from tgdsl.plan.plan import Plan
 from tgdsl.runtime.connect import simulate
-from tgdsl.tuning.compile import compile
+from tgdsl.tuning.compile import compile_plan
 
 BOX = '<geom type="box" size=".02 .02 .02"/>'
 BALL = '<geom type="sphere" size=".02"/>'
 Point = Sequence[Any]
+HERE = "{folder}"
 
 
 @contextmanager
@@ -41,9 +45,21 @@ def temporary(build: Callable[..., Any], *arguments: Any, **fields: Any) -> Any:
 
 def compiled(document: Mapping[str, Any], dtype: torch.dtype = torch.float64) -> TactileModule:
     """Return a document's module; its poses are made up, so that taxels which nothing could touch are no mistake."""
-    with warnings.catch_warnings():
+    model = Path(document["robot"]["model"])
+    files = tuple((file.name, file.read_bytes()) for file in sorted(model.parent.iterdir()) if file.is_file())
+    text = json.dumps(document, default=lambda value: value.tolist()).replace(str(model.parent), HERE)
+    return TactileModule(_plan_of(text, files), dtype=dtype)
+
+
+@functools.lru_cache(maxsize=64)
+def _plan_of(document: str, files: tuple[tuple[str, bytes], ...]) -> Plan:
+    """Return the plan of a document as JSON with the files beside its model, whose folder it calls `HERE`."""
+    with folder() as where, warnings.catch_warnings():
         warnings.simplefilter("ignore", UnfeltWarning)
-        return compile(document, dtype=dtype)
+        warnings.simplefilter("ignore", CoarseCellsWarning)  # some cases are about coarse cells
+        for name, content in files:
+            (where / name).write_bytes(content)
+        return compile_plan(json.loads(document.replace(HERE, str(where))))
 
 
 def points(places: Sequence[Point] | np.ndarray, radius: float, normal: Point = (0, 0, 1)) -> dict[str, Any]:
