@@ -58,9 +58,11 @@ def _fields(one: Any, other: Any, prefix: str) -> Iterator[tuple[str, Any, Any]]
 
 
 def _same(one: Any, other: Any, is_rounded: bool) -> bool:
-    if isinstance(one, bytes):
-        return one == other
+    if not isinstance(one, np.ndarray) and one == other:
+        return True
     first, second = np.asarray(one), np.asarray(other)
+    if first.shape == second.shape and first.tobytes() == second.tobytes():
+        return True
     is_real = first.dtype.kind == "f"
     if is_rounded and is_real:
         return first.shape == second.shape and np.allclose(first, second, rtol=ROUNDED, atol=TINY, equal_nan=True)
