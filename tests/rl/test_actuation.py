@@ -139,13 +139,13 @@ def test_backlash_is_crossed_at_each_reversal(tmp_path, simulator):
     """The joint, damped so that it never overshoots, follows a target up, rests while it crosses the play, and follows it down."""
     sim, actuation = hinge(tmp_path, simulator, kv=0.3, drive=DriveSpec(backlash=(0.2, 0.2)), substeps=160)
     ends = []
-    for target in (0.5, 0.45, 0.31, 0.2, 0.0, 0.1, 0.2, 0.3):
+    for target in (0.5, 0.31, 0.0, 0.2, 0.3):
         for _ in range(4):
             actuation.command(targets(sim, target))
             sim.step()
         ends.append(float(sim.qpos[0, 0]))
     # 0.5 − 0.1 going up; at rest down to 0.3; then target + 0.1 going down; at rest up to 0.2; then target − 0.1 going up
-    np.testing.assert_allclose(ends, [0.4, 0.4, 0.4, 0.3, 0.1, 0.1, 0.1, 0.2], atol=2e-3)
+    np.testing.assert_allclose(ends, [0.4, 0.4, 0.1, 0.1, 0.2], atol=2e-3)
 
 
 @BOTH
