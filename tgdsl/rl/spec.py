@@ -31,11 +31,9 @@ def _touch_type(name: str) -> str:
     return name
 
 
-def _list_touch_types(schema: dict[str, Any]) -> None:
-    schema["enum"] = ["none", *touch_types()]
-
-
-TouchType = Annotated[str, AfterValidator(_touch_type), Field(json_schema_extra=_list_touch_types)]
+TouchType = Annotated[
+    str, AfterValidator(_touch_type), Field(json_schema_extra=lambda schema: schema.update(enum=["none", *touch_types()]))
+]
 ForceRange = Annotated[Range, RangeOf("force")]
 Impedance = Annotated[float, Quantity("number", ge=1e-4), Field(le=0.9999)]  # between the bounds that MuJoCo has
 Power = Annotated[float, Quantity("number", ge=1.0)]

@@ -56,8 +56,6 @@ class Radius(Stage):
     name = "radius_noise"
 
     class Knobs(SpecModel):
-        """Knob of `Radius`."""
-
         radius_noise: Annotated[LengthRange, Usual("length", high=0.1)] = ZERO
         """ρ, half-width of the uniform disturbance of each probe's radius, drawn at each reading [m]."""
 
@@ -82,8 +80,6 @@ class Gain(Stage):
     name = "gain"
 
     class Knobs(SpecModel):
-        """Knob of `Gain`."""
-
         gain: tuple[Factor, Factor] = ((1.0, 1.0), (1.0, 1.0))
         """Lowest and highest gain: each probe draws its own at reset."""
 
@@ -134,8 +130,6 @@ class Hysteresis(Stage):
     needs_dt = True
 
     class Knobs(SpecModel):
-        """Knob of `Hysteresis`."""
-
         hysteresis: MaxwellBranch | None = None
         """Viscoelastic memory."""
 
@@ -178,8 +172,6 @@ class Delay(Stage):
     needs_dt = True
 
     class Knobs(SpecModel):
-        """Knobs of `Delay`."""
-
         read_delay: Annotated[TimeRange, Usual("time", high=1.0)] = ZERO
         """Age of the signal that is read [s]; between two calls the signal counts as linear."""
         jitter: Annotated[TimeRange, Usual("time", high=1.0)] = ZERO
@@ -247,8 +239,6 @@ class Offset(Stage):
     is_split = True
 
     class Knobs(SpecModel):
-        """Knobs of `Offset`."""
-
         bias: AnyAmplitude = NO_AMPLITUDE
         """Constant offset [unit of the reading]."""
         white_noise: NonNegativeAmplitude = NO_AMPLITUDE
@@ -300,8 +290,6 @@ class Quantization(Stage):
     name = "quantization"
 
     class Knobs(SpecModel):
-        """Knob of `Quantization`."""
-
         quantization: NonNegativeAmplitude = NO_AMPLITUDE
         """Step of the quantiser [unit of the reading]; 0: none."""
 
@@ -326,8 +314,6 @@ class Dead(Stage):
     name = "dead"
 
     class Knobs(SpecModel):
-        """Knobs of `Dead`."""
-
         dead_probability: Share = ZERO
         """Chance that a taxel is dead for an episode."""
         dead_range: tuple[AnyAmplitude, AnyAmplitude] = (NO_AMPLITUDE, NO_AMPLITUDE)
@@ -369,8 +355,6 @@ class Release(Stage):
     name = "release_threshold"
 
     class Knobs(SpecModel):
-        """Knob of `Release`."""
-
         release_threshold: Annotated[LengthRange | None, Usual("length", high=0.1)] = None
         """Depth below which a `contact` taxel switches off again [m]; default: the sensor's own."""
 
@@ -409,8 +393,6 @@ class Crosstalk(Stage):
     name = "crosstalk"
 
     class Knobs(SpecModel):
-        """Knob of `Crosstalk`."""
-
         crosstalk: Neighbourhood | None = None
         """Mixing of neighbouring taxels."""
 
