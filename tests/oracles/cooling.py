@@ -91,7 +91,7 @@ def both_losses(seconds: float = 600.0):
     at=["100 to 50 s", "200 to 100 s"], atol=0.2,
 )  # fmt: skip
 def order_of_losses():
-    fine = cooled(1.0, 800.0, emissivity=0.9, convection=5.0)
+    fine = cooled(5.0, 800.0, emissivity=0.9, convection=5.0)
     errors = [abs(cooled(dt, 800.0, emissivity=0.9, convection=5.0) - fine) for dt in (50.0, 100.0, 200.0)]
     return 2.0, np.log2(np.divide(errors[1:], errors[:-1]))
 
