@@ -62,6 +62,7 @@ SHOTS = {
     "tasks/in_palm_rotate": Shot("item", 0.19, 60, -50, "in_palm_rotate", 2.0),
     "tasks/in_palm_rotate_cube": Shot("item", 0.19, 60, -50, "in_palm_rotate_cube"),
     "tasks/in_palm_rotate_cube_held": Shot("item", 0.19, 60, -50, "in_palm_rotate_cube_held", 2.1),
+    "tasks/in_palm_rotate_held": Shot("item", 0.19, 60, -50, "in_palm_rotate_held", 2.1),
     "tasks/in_palm_rotate_cube_gentle": Shot(
         "item", 0.19, 60, -50, "in_palm_rotate_cube_held", 2.6, (("action.smoothing", 0.6),)
     ),
