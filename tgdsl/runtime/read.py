@@ -29,8 +29,8 @@ def read_mujoco(
 ) -> SceneState:
     """Return the state of a scene that `mujoco.mj_step` steps: tensors (env, …), float64, on the module's device.
 
-    Call `mj_forward` first: `mj_step` leaves poses, velocities and contacts one step behind joints and controls. Fields that
-    MuJoCo does not know, such as `dt` and `variant`, are None.
+    Set the controls and call `mj_forward` first: `mj_step` leaves poses, velocities and contacts one step behind joints, and
+    contact forces depend on the controls. Fields that MuJoCo does not know, such as `dt` and `variant`, are None.
 
     Args:
         touch: The module that will read the state.
