@@ -40,7 +40,7 @@ def test_documents_of_tasks_and_of_sensors_are_told_apart(here):
     task = EXAMPLES / "tasks" / "in_palm_rotate_cube.yaml"
     code, _, error = here(task.parent, "run", task.name)
     assert (code, error.splitlines()[1:]) == (2, ["1 mistake"])
-    assert "task: this is a task's document, expected one of sensors; its own is palm.yaml" in error
+    assert "task: this is a task's document, expected one of sensors; its sensors are in palm.yaml: name that file" in error
     code, _, error = here(task.parent, "play", "palm.yaml")
     assert code == 2 and "this is a document of sensors, which a task's document names: `document: …`" in error
 

@@ -90,7 +90,6 @@ object: rod
 joints: [left, right]
 keyframe: open
 touch: none
-action: {{scale: 0.002}}
 {grasps}
 """
 GRASPS = "grasps: {num: 6, squeeze: [0.005, 0.012], spread: 0.004, yaw: [0, 0.1], max_tilt: 0.2, push: 0.2 N}"

@@ -277,6 +277,11 @@ def test_slides_have_a_scale_of_their_own_and_none_of_what_is_an_angle():
     arrays["qvel"].fill_(2.0)  # beyond the hinge's top speed
     actuation.drive()
     torch.testing.assert_close(actuation.torque, torch.tensor([[0.5, 0.0]]).double().expand(3, 2))
+    slide = Actuators.of(model, ["slide"])
+    with pytest.raises(
+        SimulationError, match=r"action.scale is 0.1 rad, but .* slides alone: slide; expected action.slide_scale"
+    ):
+        Actuation(slide, arrays, ActionSpec(scale=0.1, slide_scale=0.01), drive, Draws(0, 3))
 
 
 def drawn(seed=0, num_envs=64, first_env=0, episode=1, spec=PAPER):

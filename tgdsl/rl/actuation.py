@@ -211,6 +211,9 @@ class Actuation:
         unlimited = [name for name, limit in zip(actuators.names, actuators.limit, strict=True) if not np.isfinite(limit)]
         if unlimited and (drive.torque_noise or drive.top_speed or drive.strength != ONE):
             raise SimulationError(f"joints {listed(unlimited)} have no largest torque, of which this drive's is a share")
+        if "scale" in action.model_fields_set and not isinstance(action.scale, str) and actuators.is_slide.all():
+            problem = f"action.scale is {action.scale:g} rad, but the policy moves slides alone: {listed(actuators.names)}"
+            raise SimulationError(f"{problem}; expected action.slide_scale [m]")
         self._index = {f: torch.from_numpy(getattr(actuators, f)).to(device, torch.int64) for f in ("actuator", "qpos", "dof")}
         self._is_slide = actuators.is_slide
         scale = 0.5 * (actuators.high - actuators.low)

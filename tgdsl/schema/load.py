@@ -126,7 +126,7 @@ def load(
     else:
         source, folder = read_source(FilePath(document), str(document)), FilePath(document).parent
     if isinstance(source.value, dict) and "task" in source.value and "sensors" not in source.value:
-        hint = f"its own is {source.value['document']}" if "document" in source.value else ""
+        hint = f"its sensors are in {source.value['document']}: name that file" if "document" in source.value else ""
         raise SpecError([source.problem(("task",), "this is a task's document, expected one of sensors", hint, on_key=True)])
     for dotted, value in (overrides or {}).items():
         source.set(dotted, value)

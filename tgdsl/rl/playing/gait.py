@@ -94,7 +94,8 @@ class Gait:
             (name, _cell(self.saturations.get(name), SHARE), f"{speed:.3g}", _cell(self.rated_speeds.get(name), "number"))
             for name, speed in self.joint_speeds.items()
         ]
-        parts.append(text_table(("joint", "at its torque limit", "speed, 99 % below [rad/s]", "rated speed [rad/s]"), joints))
+        unit = "[rad/s, slides m/s]"
+        parts.append(text_table(("joint", "at its torque limit", f"speed, 99 % below {unit}", f"rated speed {unit}"), joints))
         return "\n\n".join(parts)
 
 
