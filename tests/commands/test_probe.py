@@ -5,6 +5,8 @@ import os
 from faulty_lines import Faults, FaultyEmulator
 from first_order_hands import first_order_hand
 
+from tgdsl.runtime.xhand1.wire import ports
+from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.protocol import Command
 
 
@@ -48,10 +50,12 @@ def test_a_computer_without_ports(plugged, here, tmp_path):
     assert here(tmp_path, "hand", "monitor") == (2, "", "tgdsl: no hand answers; this computer has no serial port\n")
 
 
-def test_no_hand_or_several_are_an_error_that_lists_them(emulator, plugged, here, tmp_path):
+def test_no_hand_or_several_are_an_error_that_lists_them(emulator, plugged, here, tmp_path, monkeypatch):
     with FaultyEmulator(first_order_hand(3)) as second:
         plugged(emulator.device, second.device)
-        code, _, error = here(tmp_path, "hand", "monitor", "--seconds", "0.1")
+        with monkeypatch.context() as patient:  # two emulators on a busy computer
+            patient.setattr(ports, "_PATIENT", SerialTiming(reply_timeout_s=0.4))
+            code, _, error = here(tmp_path, "hand", "monitor", "--seconds", "0.1")
         assert code == 2
         found = f"{emulator.device} (id 0), {second.device} (id 3)"
         assert error == f"tgdsl: 2 hands answer: {found}; choose one with --port or --hand-id\n"
