@@ -152,7 +152,7 @@ def test_a_document_may_name_a_file(tmp_path, not_sampled):
     document.write_text(document.read_text().replace("{num: 6", '{file: "own grasps.npz", num: 6'))
     write_grasps(grasps, tmp_path / "own grasps.npz")
     error = refused(lambda: TouchEnv(document, 2, threads=1))
-    assert (error.file, error.path, error.line) == (str(document), "grasps.file", 9)
+    assert (error.file, error.path, error.line) == (str(document), "grasps.file", 8)
     assert "grasps of another scene (aaaaaaaaaaaa, expected" in error.what
     write_grasps(replace(grasps, scene=digest, variant=np.ones(6, dtype=np.int64)), tmp_path / "own grasps.npz")
     assert "no grasps of variant 0 of rod" in refused(lambda: TouchEnv(document, 2, threads=1)).what

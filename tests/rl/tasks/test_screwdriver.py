@@ -20,7 +20,7 @@ from tgdsl.rl.tasks.screwdriver import Screwdriver
 DOCUMENT = Path(__file__).parents[3] / "examples" / "tasks" / "screwdriver.yaml"
 ODD = {
     "episode": "0.6 s", "max_spin": 1.0, "near_width": "3 mm", "free_distance": "2 mm", "drop_tilt": 0.3, "engagement": "8 mm",
-    "action.scale": 0.01, "randomise.push": {"x": ["-3 N", "3 N"], "y": ["-3 N", "3 N"], "interval": ["0.1 s", "0.2 s"]},
+    "action.slide_scale": 0.01, "randomise.push": {"x": ["-3 N", "3 N"], "y": ["-3 N", "3 N"], "interval": ["0.1 s", "0.2 s"]},
     "rewards": {name: 1.5 * value or -0.5 for name, value in Screwdriver.Rewards()}, "max_force": "0.1 N", "hold": {"coasting_pay": 0.25},
 }  # fmt: skip
 """Other numbers than the document's, and enough going on that every term is seen."""
