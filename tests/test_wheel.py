@@ -55,9 +55,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_a_robot_of_the_wheel_compiles_and_runs(wheel, tmp_path):
-    """On another Python than that of all other tests."""
-    version = "3.11" if sys.version_info[:2] == (3, 13) else "3.13"
+@pytest.mark.parametrize("version", ["3.11", "3.13"])
+def test_a_robot_of_the_wheel_compiles_and_runs(wheel, version, tmp_path):
     python = python_of(version)
     if python is None:
         pytest.skip(f"there is no Python {version}")

@@ -83,12 +83,13 @@ def test_the_same_bytes_twice(document, artifact, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_same_bytes_from_another_process(document, artifact, tmp_path):
+def test_the_same_bytes_from_other_processes(document, artifact, tmp_path):
     program = "import sys; from tgdsl.module.artifact import *; from tgdsl.compiler.pipeline import *; save_plan(compile_document(sys.argv[1]).plan, sys.argv[2])"
-    out = tmp_path / "other.safetensors"
-    command = [sys.executable, "-c", program, str(document), str(out)]
-    subprocess.run(command, env={**os.environ, "PYTHONHASHSEED": "4242"}, cwd=tmp_path, check=True)
-    assert out.read_bytes() == artifact.read_bytes()
+    for seed in ("1", "4242"):
+        out = tmp_path / f"{seed}.safetensors"
+        command = [sys.executable, "-c", program, str(document), str(out)]
+        subprocess.run(command, env={**os.environ, "PYTHONHASHSEED": seed}, cwd=tmp_path, check=True)
+        assert out.read_bytes() == artifact.read_bytes()
 
 
 def test_a_plan_comes_back_whole(document, artifact):

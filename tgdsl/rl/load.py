@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import sys
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from os import PathLike
@@ -82,7 +82,8 @@ def load_task(document: str | PathLike[str] | Mapping[str, Any], overrides: Mapp
     terms = _terms(source, folder, task, spec, problems) if isinstance(spec, TaskSpec) else {}
     if isinstance(spec, TaskSpec) and task.own_groups is not None:
         added = [name for name, term in terms.items() if isinstance(term, ObservationTerm)]
-        problems += wrong_groups(source, spec, [*SHARED_GROUPS, *added, *task.own_groups])
+        named = {**train_groups(spec), ("distill", "groups"): spec.distill.groups}
+        problems += wrong_groups(source, named, [*SHARED_GROUPS, *added, *task.own_groups])
     if problems or not isinstance(spec, TaskSpec):
         raise SpecError(problems)
     return LoadedTask(spec, task, source, folder, terms)
@@ -124,23 +125,26 @@ def _terms(source: Source, folder: Path, task: type[Task[Any]], spec: TaskSpec, 
     return terms
 
 
-def wrong_groups(source: Source, spec: TaskSpec, groups: Collection[str], empty: Collection[str] = ()) -> list[Problem]:
-    """Return the groups of observations that learners name and that are not among `groups`, or are empty, located."""
+def train_groups(spec: TaskSpec) -> dict[tuple[str, ...], Sequence[str] | None]:
+    """Return the groups of observations that a learner names, by place in the document; None where the default holds."""
     train = spec.train
-    named = {
-        ("train", "actor"): train.actor,
-        ("train", "critic"): train.critic,
-        ("train", "rnd", "groups"): None if train.rnd == "off" else train.rnd.groups,
-        ("distill", "groups"): spec.distill.groups,
-    }
-    places = [((*place, i), name) for place, names in named.items() for i, name in enumerate(names or ())]
-    return [
-        source.problem(place, f'there is no group of observations "{name}"', did_you_mean(name, groups, "groups"))
-        if name not in groups
-        else source.problem(place, f'the group of observations "{name}" is empty')
-        for place, name in places
-        if name not in groups or name in empty
-    ]
+    named: dict[tuple[str, ...], Sequence[str] | None] = {("train", "actor"): train.actor, ("train", "critic"): train.critic}
+    return named if train.rnd == "off" else {**named, ("train", "rnd", "groups"): train.rnd.groups}
+
+
+def wrong_groups(
+    source: Source, named: Mapping[tuple[str, ...], Sequence[str] | None], groups: Collection[str], empty: Collection[str] = ()
+) -> list[Problem]:
+    """Return, located, the groups of observations that are named and are not among `groups`, or are empty."""
+    problems = []
+    for place, names in named.items():
+        for i, name in enumerate(names or ()):
+            if name not in groups:
+                problem, hint = f'there is no group of observations "{name}"', did_you_mean(name, groups, "groups")
+                problems.append(source.problem((*place, i), problem, hint))
+            elif name in empty:
+                problems.append(source.problem((*place, i), f'the group of observations "{name}" is empty'))
+    return problems
 
 
 def number_owners(task: type[Task[Any]], spec: TaskSpec, terms: Mapping[str, Term]) -> dict[str, SpecModel]:

@@ -93,6 +93,8 @@ def test_groups_that_are_not_there_are_located(tmp_path):
         loaded(tmp_path, "train: {critic: [proprio, gaol]}\n")
     with pytest.raises(SpecError, match=r'train\.actor\[0\]: there is no group of observations "tactile_sensors"'):
         small_learner(tmp_path, touch="none", train__actor="[tactile_sensors]")
+    # What students feel need not be there for their teacher.
+    assert observed(loaded(tmp_path, "distill: {groups: [proprio, tactile_sensors]}\n"), GROUPS | {"tactile_sensors": 0})
     own = "from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\nclass Own(InPalmRotate):\n    def observe(self, now):\n"
     (tmp_path / "own.py").write_text(f"{own}        return {{}}\n")  # its groups are known in environments alone
     task = loaded(tmp_path, "train: {rnd: {groups: [empty]}, actor: [gaol]}\n", task="own.py:Own")

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.errors import SpecError, TgdslError, did_you_mean
 from tgdsl.layout.layout import Layout
 from tgdsl.module.taxels import image_indices
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.load import LoadedTask
+from tgdsl.rl.load import LoadedTask, wrong_groups
 from tgdsl.rl.playing.policy import (
     ACTOR_GROUPS,
     OF_TOUCH,
@@ -105,10 +105,8 @@ def groups_of(loaded: LoadedTask, groups: Mapping[str, int]) -> list[str]:
     """Return the groups of observations that all students see, with `tactile_sensors` where touch stands among them."""
     named = loaded.spec.distill.groups
     other_groups = [name for name in groups if not name.startswith(f"{GROUP}/")]
-    for i, name in enumerate(named or ()):
-        if name not in other_groups:
-            problem = f'there is no group of observations "{name}" beside what each student feels'
-            raise loaded.error(("distill", "groups", i), problem, did_you_mean(name, other_groups, "groups"))
+    if problems := wrong_groups(loaded.source, {("distill", "groups"): named}, other_groups):
+        raise SpecError(problems)
     if named:
         return [*named, GROUP]
     return [name for name in ACTOR_GROUPS if name in groups or name == GROUP]

@@ -27,7 +27,7 @@ from torch import Tensor
 from tgdsl.errors import SpecError
 from tgdsl.rl.adapters.rsl_rl import TouchVecEnv
 from tgdsl.rl.env import Step, TouchEnv
-from tgdsl.rl.load import LoadedTask, wrong_groups
+from tgdsl.rl.load import LoadedTask, train_groups, wrong_groups
 from tgdsl.rl.playing.policy import card_texts, write_onnx_policy, write_policy
 from tgdsl.rl.playing.rollout import Actor, Moment, rollout
 from tgdsl.rl.sensed import GROUP
@@ -230,7 +230,7 @@ def observed(loaded: LoadedTask, groups: Mapping[str, int]) -> dict[str, list[st
     """Return the groups of observations of actor, critic and, if there is one, random network distillation."""
     train = loaded.spec.train
     empty = [name for name, size in groups.items() if size == 0]
-    if problems := wrong_groups(loaded.source, loaded.spec, groups, empty):
+    if problems := wrong_groups(loaded.source, train_groups(loaded.spec), groups, empty):
         raise SpecError(problems)
     privileged = [name for name in groups if name not in (PROPRIO, GROUP)]
     actor = list(train.actor or [name for name in privileged if name != PROPS])
