@@ -370,10 +370,12 @@ def _wrong(model: object) -> str:
 
 
 TYPES = Registry(
-    *("tgdsl.observations", "observation type", "observation types"),
-    get_args(get_args(ObservationSpec)[0]),
-    _wrong,
-    lambda model: get_args(model.model_fields["type"].annotation)[0],
+    group="tgdsl.observations",
+    what="observation type",
+    plural="observation types",
+    own=get_args(get_args(ObservationSpec)[0]),
+    wrong=_wrong,
+    name_of=lambda model: get_args(model.model_fields["type"].annotation)[0],
 )
 register = TYPES.register
 

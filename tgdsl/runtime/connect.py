@@ -105,8 +105,8 @@ def connect(
     for option in options:
         if option not in kind.options:
             raise TgdslError(f'"{name}" has no option "{option}"; {did_you_mean(option, kind.options, "options")}')
-    opens = partial(_open_simulator, kind) if isinstance(kind, SimulatorKind) and kind.open is None else kind.open
-    return opens(touch, name, **{option: shared[option] for option in kind.options if option in shared}, **options)
+    open_source = partial(_open_simulator, kind) if isinstance(kind, SimulatorKind) and kind.open is None else kind.open
+    return open_source(touch, name, **{option: shared[option] for option in kind.options if option in shared}, **options)
 
 
 @overload
