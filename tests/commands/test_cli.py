@@ -56,9 +56,17 @@ def base(tmp_path_factory):
     return folder
 
 
+WITHOUT_PROGRESS = """
+from tgdsl.commands.cli import main
+from tgdsl.console import progress
+progress.LINE_PERIOD = 1e6  # no lines of progress on a busy machine
+main()
+"""
+
+
 def tgdsl_in(folder: Path, *arguments: str, filters: str = "error") -> subprocess.CompletedProcess:
     environment = {**os.environ, "PYTHONWARNINGS": filters, "PYTHONPATH": str(REPOSITORY), "NO_COLOR": "1", "COLUMNS": "200"}
-    command = [sys.executable, "-m", "tgdsl", *arguments]
+    command = [sys.executable, "-c", WITHOUT_PROGRESS, *arguments]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
 
@@ -195,7 +203,7 @@ def test_schema_command(tmp_path, here):
 def test_a_mistake_ends_without_a_traceback(base):
     ran = tgdsl_in(base, "run", "pad.safetensors", "--keyframes", "rest", "sqeeze")
     assert (ran.returncode, ran.stdout) == (2, "")
-    assert ran.stderr.splitlines(keepends=True)[-1] == 'tgdsl: the scene has no keyframe "sqeeze"; did you mean "squeeze"?\n'
+    assert ran.stderr == 'tgdsl: the scene has no keyframe "sqeeze"; did you mean "squeeze"?\n'
 
 
 # run
@@ -205,7 +213,7 @@ def test_a_mistake_ends_without_a_traceback(base):
 def test_run(base, tmp_path):
     ran = tgdsl_in(base, "run", "pad.safetensors", "--seconds", "0.1", "--out", str(tmp_path / "out"), filters="default")
     assert ran.returncode == 0, ran.stderr
-    assert "Warning" not in ran.stderr
+    assert ran.stderr == ""
     lines = ran.stdout.splitlines()
     assert lines[0] == "t = 0.30 s"
     assert lines[1].split() == ["link", "touch", "[N]", "bit", "[taxels]"]
