@@ -5,10 +5,10 @@
     python examples/learn.py --all --seeds 3 --jobs 9 --threads 1
     python examples/learn.py --plot out/learn                    # table and curve of the runs that are there
 
-What a policy sees besides its own command (targets, last action, time left): with `--touch` the taxels of the fingertip; with
-`--blind` nothing; with `--joints` measured positions and velocities of the joints, whose error betrays contact. The critic,
-which is gone after learning, also sees where the ridge is, in all three. Then the policy is evaluated without exploration, in
-episodes that are the same for all.
+All policies see their own command: targets, last action, time left. With `--touch` a policy also sees the taxels of the
+fingertip, with `--joints` measured positions and velocities of the joints, whose error betrays contact. `--blind` adds nothing.
+The critic, which only learning needs, sees where the ridge is in all three. Then the policy is evaluated without exploration,
+in the same episodes for all.
 
 A run writes NAME.json (results and curve) and NAME.pt, the policy: tgdsl play examples/tasks/find_ridge.yaml --policy NAME.pt
 --groups command tactile_sensors. From the same seed, numbers of environments, threads and iterations follow the same results.
@@ -41,11 +41,11 @@ TASK = Path(__file__).parent / "tasks/find_ridge.yaml"
 SEES = {"touch": ("command", "tactile_sensors"), "blind": ("command",), "joints": ("command", "proprio")}
 """Groups of observations of each condition's policy."""
 PRIVILEGED = ("proprio", "priv_ridge")
-"""What the critic sees besides."""
+"""What the critic sees in addition."""
 STEPS = 40
 """Control steps between updates: half an episode."""
 EVALUATION_SEED, EVALUATION_ENVS = 1_000_003, 250
-SAID_EVERY = 5.0
+PRINT_INTERVAL = 5.0
 """Time between lines of progress [s]."""
 
 
@@ -53,8 +53,8 @@ SAID_EVERY = 5.0
 class Result:
     """One run: `success` and its 95 % `interval` are of the evaluation.
 
-    Each row of `curve` is an iteration in which episodes ended: minutes, episodes so far, and the share of those that ended in
-    it which went well, with exploration.
+    Each row of `curve` is an iteration in which episodes ended: minutes, episodes so far, and the share of this iteration's
+    episodes that succeeded, with exploration.
     """
 
     condition: str
@@ -72,7 +72,7 @@ class Result:
 
 
 class Counted(TouchVecEnv):
-    """Environments that count the episodes which have ended, and which of these went well."""
+    """Environments that count ended episodes and successes."""
 
     def __init__(self, touch_env: TouchEnv):
         """Begin to count."""
@@ -81,11 +81,11 @@ class Counted(TouchVecEnv):
 
     def step(self, actions: torch.Tensor) -> Any:
         """Make one control step."""
-        made = super().step(actions)
-        if "log" in made[3]:
-            score = made[3]["log"]["Episode/score"]
+        stepped = super().step(actions)
+        if "log" in stepped[3]:
+            score = stepped[3]["log"]["Episode/score"]
             self.ended, self.successes = self.ended + len(score), self.successes + float(score.sum())
-        return made
+        return stepped
 
 
 def settings(condition: str) -> dict[str, Any]:
@@ -128,19 +128,19 @@ def learn(condition: str, seed: int, num_envs: int, threads: int, minutes: float
     for model in (runner.alg.actor, runner.alg.critic):
         assert isinstance(model.obs_normalizer, EmpiricalNormalization)
         model.obs_normalizer.eps = 1e-5  # rsl_rl's 0.01 would hide depths, which are in metres
-    begun, said, curve, done = time.monotonic(), 0.0, [], 0
-    while not is_done(done, iterations, time.monotonic() - begun, 60.0 * minutes):
-        before, well = env.ended, env.successes
+    start, printed, curve, done = time.monotonic(), 0.0, [], 0
+    while not is_done(done, iterations, time.monotonic() - start, 60.0 * minutes):
+        num_ended, successes = env.ended, env.successes
         runner.learn(1)
         runner.current_learning_iteration, done = runner.current_learning_iteration + 1, done + 1
-        passed = time.monotonic() - begun
-        if env.ended > before:
-            curve.append((passed / 60.0, env.ended, (env.successes - well) / (env.ended - before)))
-        if passed - said > SAID_EVERY and curve:
-            said = passed
+        passed = time.monotonic() - start
+        if env.ended > num_ended:
+            curve.append((passed / 60.0, env.ended, (env.successes - successes) / (env.ended - num_ended)))
+        if passed - printed > PRINT_INTERVAL and curve:
+            printed = passed
             left = 60.0 * minutes - passed if iterations is None else passed / done * (iterations - done)
             print(line(condition, seed, curve, left, num_envs * STEPS * done / passed), flush=True)
-    passed = time.monotonic() - begun
+    passed = time.monotonic() - start
     success, num = evaluate(runner, condition, threads)
     chance = chance_of()
     result = Result(
@@ -203,8 +203,8 @@ def write(result: Result, runner: OnPolicyRunner, out: Path) -> None:
 
 def read(folder: Path) -> list[Result]:
     """Return the runs that a folder holds, by condition and seed."""
-    found = [Result(**json.loads(file.read_text())) for file in sorted(folder.glob("*_*.json"))]
-    return sorted(found, key=lambda run: (list(SEES).index(run.condition), run.seed))
+    runs = [Result(**json.loads(file.read_text())) for file in sorted(folder.glob("*_*.json"))]
+    return sorted(runs, key=lambda run: (list(SEES).index(run.condition), run.seed))
 
 
 def table(results: Sequence[Result]) -> str:
@@ -219,7 +219,7 @@ def table(results: Sequence[Result]) -> str:
 
 
 def plot(results: Sequence[Result], file: Path) -> None:
-    """Draw success, with exploration, against the episodes that were seen, and that of the evaluations at the right."""
+    """Draw success with exploration against episodes, and the success of the evaluation as a dot at the end."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -241,7 +241,7 @@ def plot(results: Sequence[Result], file: Path) -> None:
 
 
 def learn_all(seeds: int, jobs: int, passed_on: Sequence[str]) -> None:
-    """Make all runs, each in a process of its own, some at once."""
+    """Make all runs, each in its own process, `jobs` at once."""
     waiting = [(condition, seed) for seed in range(1, seeds + 1) for condition in SEES]
     running: list[subprocess.Popen[bytes]] = []
     while waiting or running:
@@ -259,7 +259,7 @@ def main() -> None:
     for condition in SEES:
         parser.add_argument(f"--{condition}", dest="condition", action="store_const", const=condition, default="touch")
     parser.add_argument("--all", action="store_true", help="all conditions, with each of --seeds")
-    parser.add_argument("--plot", type=Path, metavar="FOLDER", help="no run, but the table and curve of those in FOLDER")
+    parser.add_argument("--plot", type=Path, metavar="FOLDER", help="draw table and curve of the runs in FOLDER, and run none")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--seeds", type=int, default=3, help="with --all: how many")
     parser.add_argument("--jobs", type=int, default=1, help="with --all: runs at once")
@@ -268,14 +268,14 @@ def main() -> None:
     parser.add_argument("--envs", type=int, default=128)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("out/learn"))
-    given = parser.parse_args()
-    folder = given.plot or given.out
-    if given.all:
-        limit = ["--minutes", str(given.minutes)] if given.iterations is None else ["--iterations", str(given.iterations)]
-        passed_on = [*limit, "--envs", str(given.envs), "--threads", str(given.threads), "--out", str(given.out)]
-        learn_all(given.seeds, given.jobs, passed_on)
-    elif given.plot is None:
-        run = learn(given.condition, given.seed, given.envs, given.threads, given.minutes, given.iterations, given.out)
+    args = parser.parse_args()
+    folder = args.plot or args.out
+    if args.all:
+        limit = ["--minutes", str(args.minutes)] if args.iterations is None else ["--iterations", str(args.iterations)]
+        passed_on = [*limit, "--envs", str(args.envs), "--threads", str(args.threads), "--out", str(args.out)]
+        learn_all(args.seeds, args.jobs, passed_on)
+    elif args.plot is None:
+        run = learn(args.condition, args.seed, args.envs, args.threads, args.minutes, args.iterations, args.out)
         print(f"{run.condition} {run.seed}: {run.success:.1%} of {run.evaluated} episodes; chance is {run.chance:.1%}")
     if results := read(folder):
         print(table(results), end="")

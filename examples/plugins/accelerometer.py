@@ -53,18 +53,18 @@ class AccelerometerSpec(LinkSpec):
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     """Gravity in the world, g [m/s²]."""
     substeps: Annotated[StrictInt, Field(ge=0)] = 0
-    """Physics steps of a call, each of which gives a sample; 0: one reading per call [1]."""
+    """Physics steps of a call, one sample each; 0: one reading per call [1]."""
 
 
 def reference(
     spec: AccelerometerSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return y (imu, 3) [m/s²], and what is remembered."""
+    """Return y (imu, 3) [m/s²], and the memory."""
     bodies, rows, after = gathered[LinkMotion], [], np.zeros((6, len(layout.links)))
     for i, link in enumerate(layout.links):
         body = bodies[layout.bodies.index(link.body)]
-        before, filtered = (np.array([state[name][i] for name in names]) for names in (VELOCITY, FILTERED))
-        acceleration = np.zeros(3) if context.is_first else (body.linvel - before) / context.dt
+        last, filtered = (np.array([state[name][i] for name in names]) for names in (VELOCITY, FILTERED))
+        acceleration = np.zeros(3) if context.is_first else (body.linvel - last) / context.dt
         force = body.rotation.T @ (acceleration - np.array(spec.gravity))
         share = 1.0 if context.is_first else 1.0 - np.exp(-2 * np.pi * spec.cutoff * context.dt)
         rows.append(filtered + share * (force - filtered))
@@ -93,9 +93,9 @@ def forward(gathered: Gathered, context: Context, constants: Constants, state: S
     motion, body = gathered[LinkMotion], constants["body"]
     rotation = planes.rot(part[:, body] for part in motion.rotation)
     velocity = planes.vec(part[:, body] for part in motion.linvel)
-    before, filtered = (planes.vec(state[name] for name in names) for names in (VELOCITY, FILTERED))
+    last, filtered = (planes.vec(state[name] for name in names) for names in (VELOCITY, FILTERED))
     still = planes.vec(torch.zeros_like(part) for part in velocity)
-    moved = planes.scale(1 / context.dt, planes.sub(velocity, before))
+    moved = planes.scale(1 / context.dt, planes.sub(velocity, last))
     acceleration = planes.where(context.is_first, still, moved)
     force = planes.rotate_back(rotation, planes.sub(acceleration, planes.split(constants["gravity"])))
     share = torch.where(context.is_first, 1.0, 1 - torch.exp(-constants["rate"] * context.dt))

@@ -49,21 +49,21 @@ class CapacitanceSpec(ProbeSpec):
     """Change of the capacitance of each taxel as a conductor comes near."""
 
     kind: Literal["capacitance"]
-    """Change of the capacitance of each taxel, from that with nothing in range [F]."""
+    """Change of each taxel's capacitance from its value with nothing in range [F]."""
     thickness: Annotated[PositiveLength, Usual("length", high=0.02)] = 1e-3
     """Thickness of the cover at rest, t [m]."""
     least_thickness: Annotated[PositiveLength, Usual("length", high=0.02)] = 1e-4
     """Thickness down to which it is compressed, t_min [m]."""
     permittivity: Positive = 2.8
-    """Relative permittivity of the cover, ε_r [1]; the default is that of silicone rubber."""
+    """Relative permittivity of the cover, ε_r [1]; default: silicone rubber."""
     range: Annotated[PositiveLength, Usual("length", high=0.5)] = 0.02
-    """Largest air gap that is told apart, r_max [m]."""
+    """Largest air gap that changes the reading, r_max [m]."""
 
     @model_validator(mode="after")
     def _ordered(self) -> CapacitanceSpec:
         if self.least_thickness > self.thickness:
-            found = f"least_thickness {self.least_thickness:g} m is above thickness {self.thickness:g} m"
-            raise ValueError(f"{found}, expected at most that")
+            problem = f"least_thickness {self.least_thickness:g} m is above thickness {self.thickness:g} m"
+            raise ValueError(f"{problem}, expected at most that")
         return self
 
 
@@ -101,7 +101,7 @@ def forward(
     gathered: Gathered, context: Context, constants: CapacitanceConstants[torch.Tensor], state: State
 ) -> tuple[dict[str, torch.Tensor], State]:
     """Return the plane of y [F], (env, taxel), as one fraction: exactly 0 at rest."""
-    distances = [found.value for found in gathered[ContactDepth].distances.values()]
+    distances = [each.value for each in gathered[ContactDepth].distances.values()]
     distance = torch.stack(distances).amin(dim=0)
     gap = torch.minimum(distance.clamp(min=0.0), constants.range)
     cover = torch.maximum(constants.least_thickness, constants.thickness + distance.clamp(max=0.0))

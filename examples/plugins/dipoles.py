@@ -44,7 +44,7 @@ class MagneticField(Request[Vec]):
 
 @dataclass(frozen=True, eq=False)
 class FieldUse(Generic[Array]):
-    """What the Plan holds of a request: (3, taxel) [m]; (object, taxel) twice, indices and 1 where a taxel feels an object."""
+    """A planned request: `pos` (3, taxel) [m]; `pair` (object, taxel), indices; `is_met`, 1 where a taxel senses the object."""
 
     objects: tuple[int, ...]
     pos: Array
@@ -57,7 +57,7 @@ class FieldUse(Generic[Array]):
 
 @dataclass(frozen=True, eq=False)
 class FieldPart(Generic[Array]):
-    """All of them."""
+    """All uses."""
 
     uses: tuple[FieldUse[Array], ...]
 
@@ -75,16 +75,16 @@ def _field(use: FieldUse[Tensor], scene: Scene) -> Vec:
     zero = pos[0].new_zeros((len(pairs.offset[0]), len(pos[0])))
     total = (zero, zero, zero)
     for i, pair, is_met in zip(use.objects, use.pair, use.is_met, strict=True):
-        own = scene.objects[i].pairs
-        rotation = planes.rot(at_probes(part, own, pair) for part in pairs.rotation)
-        q = planes.add(planes.rotate(rotation, pos), of_pairs(pairs.offset, own, pair))
+        pairs_of_object = scene.objects[i].pairs
+        rotation = planes.rot(at_probes(part, pairs_of_object, pair) for part in pairs.rotation)
+        q = planes.add(planes.rotate(rotation, pos), of_pairs(pairs.offset, pairs_of_object, pair))
         away = planes.safe_sqrt(planes.dot(q, q))
         outside, moment = away.clamp(min=use.size), planes.vec(torch.full_like(away, m) for m in use.moment)
         along = torch.where(away > use.size, 3 * planes.dot(moment, q) / outside**5, 0.0)
         across = torch.where(away > use.size, -1.0, 2.0) / outside**3
-        found = planes.add(planes.scale(along, q), planes.scale(across, moment))
+        field = planes.add(planes.scale(along, q), planes.scale(across, moment))
         weight = torch.where(away > use.range, 0.0, MU * is_met)
-        total = planes.add(total, planes.rotate_back(rotation, planes.scale(weight, found)))
+        total = planes.add(total, planes.rotate_back(rotation, planes.scale(weight, field)))
     return total
 
 
@@ -95,8 +95,8 @@ class MagneticFieldQuantity(Quantity):
 
     def plan(self, planning: Planning, uses: Sequence[Use]) -> FieldPart[np.ndarray]:
         """Number the pairs of each use."""
-        asked = [(use, use.request) for use in uses if isinstance(use.request, MagneticField)]
-        return FieldPart(tuple(_planned(planning, use, request) for use, request in asked))
+        requested = [(use, use.request) for use in uses if isinstance(use.request, MagneticField)]
+        return FieldPart(tuple(_planned(planning, use, request) for use, request in requested))
 
     def gather(self, part: FieldPart[Tensor], scene: Scene) -> tuple[Vec, ...]:
         """Return B of each use, planes (env, taxel)."""
@@ -104,18 +104,18 @@ class MagneticFieldQuantity(Quantity):
 
     def reference(self, part: FieldPart[np.ndarray], use: int, scene: ReferenceScene) -> np.ndarray:
         """Return B (taxel, 3) [T], magnet by magnet in the world."""
-        own, layout = part.uses[use], scene.layout
-        found = np.zeros_like(layout.pos)
+        planned, layout = part.uses[use], scene.layout
+        field = np.zeros_like(layout.pos)
         for t, link_id in enumerate(layout.link_id):
             link = scene.body(layout.links[link_id].body)
-            for target in (scene.objects[i] for i in own.objects):
+            for target in (scene.objects[i] for i in planned.objects):
                 magnet = scene.object_body(target)
                 q = link.pos + link.rotation @ layout.pos[t] - magnet.pos
-                m, away = magnet.rotation @ np.array(own.moment), np.linalg.norm(q)
-                if layout.radius[t] > 0 and target.body != layout.links[link_id].body and away <= own.range:
-                    b = 3 * (m @ q) * q / away**5 - m / away**3 if away > own.size else 2 * m / own.size**3
-                    found[t] += MU * link.rotation.T @ b
-        return found
+                m, away = magnet.rotation @ np.array(planned.moment), np.linalg.norm(q)
+                if layout.radius[t] > 0 and target.body != layout.links[link_id].body and away <= planned.range:
+                    b = 3 * (m @ q) * q / away**5 - m / away**3 if away > planned.size else 2 * m / planned.size**3
+                    field[t] += MU * link.rotation.T @ b
+        return field
 
 
 MAGNETIC_FIELD = MagneticFieldQuantity()
@@ -135,7 +135,7 @@ class HallSpec(ProbeSpec):
 
 
 def lower(spec: HallSpec, layout, surface_of) -> Lowered:
-    """Ask for the field; there is nothing else to it."""
+    """Request the field."""
     request = MagneticField(spec.objects, moment=spec.moment, size=spec.size, range=spec.range)
     return Lowered(tuple(Channel(f"field_{axis}", "T") for axis in "xyz"), requests=(request,))
 

@@ -68,20 +68,20 @@ def main(arguments: Sequence[str] | None = None) -> PPO:
     parser.add_argument("--envs", type=int, default=256, help="at least 2: skrl resets a single one itself")
     parser.add_argument("--steps", type=int, default=5000, help="control steps of each environment")
     parser.add_argument("--out", default="out/skrl", help="folder of TensorBoard's files and checkpoints")
-    given = parser.parse_args(arguments)
+    args = parser.parse_args(arguments)
 
-    touch_env = TouchEnv(given.task, given.envs)
+    touch_env = TouchEnv(args.task, args.envs)
     groups = [group for group in HAND if group in touch_env.groups]
     env = wrap_env(TouchVectorEnv(touch_env, groups=groups), wrapper="gymnasium")
     spaces = {"observation_space": env.observation_space, "action_space": env.action_space, "device": env.device}
     config = PPO_CFG(rollouts=24, learning_epochs=5, mini_batches=4, learning_rate=3e-4, time_limit_bootstrap=True)
     config.observation_preprocessor = RunningStandardScaler
     config.observation_preprocessor_kwargs = {"size": env.observation_space, "device": env.device}
-    config.experiment.directory = given.out
+    config.experiment.directory = args.out
     memory = RandomMemory(memory_size=config.rollouts, num_envs=env.num_envs, device=env.device)
     agent = PPO(models={"policy": Policy(**spaces), "value": Value(**spaces)}, memory=memory, cfg=config, **spaces)
     trainer_config = SequentialTrainerCfg(
-        timesteps=given.steps, headless=True, disable_progressbar=None, close_environment_at_exit=False
+        timesteps=args.steps, headless=True, disable_progressbar=None, close_environment_at_exit=False
     )
     SequentialTrainer(cfg=trainer_config, env=env, agents=agent).train()
     env.close()

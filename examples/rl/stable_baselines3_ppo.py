@@ -39,13 +39,13 @@ class Sb3VecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Make one control step; tell of each episode that has ended how it ended, its return and its last observations."""
-        obs, reward, terminated, truncated, told = self.env.step(self._actions)
+        """Make one control step; `infos` has end, return and last observations of each episode that has ended."""
+        obs, reward, terminated, truncated, info = self.env.step(self._actions)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for i in np.flatnonzero(terminated | truncated):
-            final = told["final_info"]
+            final = info["final_info"]
             infos[i] = {
-                "terminal_observation": told["final_obs"][i],
+                "terminal_observation": info["final_obs"][i],
                 "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
                 "episode": {"r": float(final["episode_return"][i]), "l": int(final["episode_steps"][i]), "t": 0.0},
                 "score": float(final["score"][i]),
@@ -61,12 +61,12 @@ class Sb3VecEnv(VecEnv):
         return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refuse: environments have no attributes of their own."""
-        raise NotImplementedError("environments have no attributes of their own")
+        """Refuse: environments have no separate attributes."""
+        raise NotImplementedError("environments have no separate attributes")
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Refuse: environments have no methods of their own."""
-        raise NotImplementedError("environments have no methods of their own")
+        """Refuse: environments have no separate methods."""
+        raise NotImplementedError("environments have no separate methods")
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         """Return that none is wrapped."""
@@ -79,14 +79,14 @@ def main(arguments: Sequence[str] | None = None) -> PPO:
     parser.add_argument("--task", default="examples/tasks/in_palm_rotate.yaml")
     parser.add_argument("--envs", type=int, default=256)
     parser.add_argument("--steps", type=int, default=5000, help="control steps of each environment")
-    given = parser.parse_args(arguments)
+    args = parser.parse_args(arguments)
 
-    touch_env = TouchEnv(given.task, given.envs)
+    touch_env = TouchEnv(args.task, args.envs)
     groups = [group for group in HAND if group in touch_env.groups]
     env = Sb3VecEnv(TouchVectorEnv(touch_env, groups=groups))
-    rollout = 24 * given.envs
+    rollout = 24 * args.envs
     model = PPO("MultiInputPolicy", env, n_steps=24, batch_size=rollout // 4, n_epochs=5, device="cpu", verbose=1)
-    model.learn(given.steps * given.envs)
+    model.learn(args.steps * args.envs)
     env.close()
     return model
 

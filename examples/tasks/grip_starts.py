@@ -50,9 +50,9 @@ class Holding:
         self.model, self.state, self.body = model, mujoco.MjData(model), int(model.body(OBJECT).id)
         low, high = model.jnt_range[: len(GUESS)].T.copy()
         low[[2, 5, 7]] = LEAST_BEND
-        found = minimize(self._misfit, GUESS, args=(width,), bounds=list(zip(low, high, strict=True)))
-        self.pose = np.concatenate([found.x, REST])
-        middle, axis = self._line(found.x)
+        solution = minimize(self._misfit, GUESS, args=(width,), bounds=list(zip(low, high, strict=True)))
+        self.pose = np.concatenate([solution.x, REST])
+        middle, axis = self._line(solution.x)
         yaw = np.arctan2(axis[1], axis[0])
         self.place = np.array([*middle, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
         stiffness = model.actuator_gainprm[:, 0]
@@ -69,8 +69,8 @@ class Holding:
             share = float(np.clip(2.0 * (time - 3.0), 0.0, 1.0))
             model.opt.gravity[2] = -9.81 * share
             model.dof_damping[model.nu :] = OIL * (1.0 - share)
-            wanted = self.pose + scale * FORCE * self.pull + share * self.weight
-            targets = opened + (wanted - opened) * min(1.0, time)
+            goal = self.pose + scale * FORCE * self.pull + share * self.weight
+            targets = opened + (goal - opened) * min(1.0, time)
             if 1.0 < time < 4.5 and i % 50 == 0:
                 scale *= np.clip(FORCE / max(self.force(), 0.1), 0.95, 1.05)
             state.ctrl[:] = targets
@@ -91,11 +91,11 @@ class Holding:
         state = self.state
         state.qpos[: self.model.nu] = [*joints, *REST]
         mujoco.mj_kinematics(self.model, state)
-        found = []
+        pads = []
         for name, (pos, normal, _) in PADS.items():
             rotation = state.body(name).xmat.reshape(3, 3)
-            found.append((state.body(name).xpos + rotation @ pos, rotation @ normal))
-        points, normals = zip(*found, strict=True)
+            pads.append((state.body(name).xpos + rotation @ pos, rotation @ normal))
+        points, normals = zip(*pads, strict=True)
         return np.array(points), np.array(normals)
 
     def _line(self, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
