@@ -12,6 +12,7 @@ from written_teachers import teacher
 from tgdsl.commands.distill import _warn_unlike
 from tgdsl.commands.sweep import run_trial
 from tgdsl.commands.sweep_document import Trial
+from tgdsl.errors import FileError
 from tgdsl.rl.load import load_task
 from tgdsl.rl.students.results import Row
 from tgdsl.rl.train.folder import read_checkpoint
@@ -153,6 +154,22 @@ def test_a_run_goes_on_with_its_teacher_wherever_that_is_now(base, here):
     teacher(base / "teacher.pt", load_task(base / "task.yaml"), ["priv_proprio"])
     code, _, error = here(base, "distill", "task.yaml", *on, "3", "--teacher", "teacher.pt")
     assert code == 2 and "--teacher teacher.pt: this run began with sub/moved.pt; begin another one" in error
+
+
+def test_a_disk_that_fills_up_names_the_command_that_goes_on(base, here, monkeypatch):
+    """With the folder of the run, not that of a resolution."""
+    written = []
+
+    def filled(state, file):
+        written.append(file)
+        if len(written) == 2:
+            raise FileError(file, "No space left on device")
+
+    monkeypatch.setattr("tgdsl.rl.train.run.write_checkpoint", filled)
+    few = (*TEACHER, "--types", "none", "--seeds", "1", "--envs", "2", "--episodes", "0", *SMALL)
+    code, _, error = here(base, "distill", "task.yaml", *few, "--iterations", "1", "-o", "run")
+    whole = "run/default/checkpoint.pt is whole, of iteration 0; to go on: tgdsl distill task.yaml --device cpu --resume run"
+    assert (code, error.splitlines()[-1]) == (2, f"tgdsl: run/default/checkpoint.pt: No space left on device; {whole}")
 
 
 def test_minutes_limit_each_start_and_are_told_of_all(base, here, monkeypatch):

@@ -15,6 +15,7 @@ from small_runs import ARGUMENTS, small_learner
 from small_tasks import small_task
 
 from tgdsl.commands.train import learner_page
+from tgdsl.errors import FileError
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.stage import LearnerStage
 from tgdsl.rl.train.folder import RunFolder, read_checkpoint
@@ -325,6 +326,16 @@ def test_an_interrupted_run_leaves_its_policy_and_says_how_to_go_on(base, here, 
     code, out, error = here(base, *shlex.split(error.splitlines()[-1])[-6:], "--iterations", "3", "--episodes", "0")
     assert code == 0, error
     assert "after 3 iterations" in out
+
+
+def test_a_policy_that_cannot_be_written_leaves_the_checkpoint_and_says_how_to_go_on(base, here, monkeypatch):
+    def no_space(_policy, _card, file):
+        raise FileError(file, "No space left on device")
+
+    monkeypatch.setattr("tgdsl.rl.train.learner.write_policy", no_space)
+    code, _, error = here(base, "train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS)
+    whole = "out/task/checkpoint.pt is whole, of iteration 1; to go on: tgdsl train task.yaml --device cpu --resume out/task"
+    assert (code, error.splitlines()[-1]) == (2, f"tgdsl: out/task/policy.pt: No space left on device; {whole}")
 
 
 def test_the_stage_of_a_learner_has_each_control_step_and_changes_nothing(tmp_path):

@@ -220,10 +220,13 @@ class _Part:
                 args.write_json(file, self._settings | {"overrides": self._given, "teacher_from_here": relative_path})
             students = {"students": [key.name for key in distiller.keys], "iteration": distiller.iteration}
             folder.begin(origin | students, loaded, env)
-            run = Run(distiller, folder, loaded.spec.distill.checkpoint, state["seconds"] if state else 0.0)
+            words = ["tgdsl", "distill", str(command.task), "--device", command.device, "--resume", str(folder.path.parent)]
+            seconds = state["seconds"] if state else 0.0
+            run = Run(distiller, folder, loaded.spec.distill.checkpoint, shlex.join(words), seconds)
             print(f"{len(self._keys)} students in {len(distiller.rollouts)} stacks, {self.envs} environments: {folder.path}")
             run.learn_with_bar(command.iterations, command.minutes, loaded.spec.distill.iterations)
-            return self._finish(distiller, origin, run), env.task.score_unit
+            with run.named_in_file_errors():
+                return self._finish(distiller, origin, run), env.task.score_unit
         finally:
             env.close()
 
@@ -242,7 +245,6 @@ class _Part:
         """Evaluate the students unless the run was stopped, write them, and return the table's rows."""
         from tgdsl.rl.playing.evaluation import evaluate_each
         from tgdsl.rl.students.results import rows_of, write_students
-        from tgdsl.rl.train.run import end_if_stopped
 
         command, keys, folder, result = self._command, distiller.keys, self._folder, []
         with StatusLine() as progress:
@@ -250,8 +252,7 @@ class _Part:
                 result = evaluate_each(distiller.env, distiller.acting(), len(keys), command.episodes, progress=progress)
             text, students = shlex.join(["tgdsl", *sys.argv[1:]]), folder.path / "students"
             write_students(distiller, self._loaded, origin, run.seconds, text, result, students, progress)
-        resume = ("--device", command.device, "--resume", str(folder.path.parent))
-        end_if_stopped(run, shlex.join(["tgdsl", "distill", str(command.task), *resume]))
+        run.end_if_stopped()
         if not result:
             folder.evaluation.unlink(missing_ok=True)  # of what they were before
             return []

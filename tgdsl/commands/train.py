@@ -115,13 +115,15 @@ class Train:
                     end = "; a run that goes on keeps its deviations" if line.startswith(INITIAL_STD) else ""
                     print(f"changed since the run began: {line}{end}")
                 folder.begin(origin, loaded, env)
-            run = Run(learner, folder, loaded.spec.train.checkpoint, state["seconds"] if state else 0.0)
+            resume = shlex.join(["tgdsl", "train", str(self.task), "--device", self.device, "--resume", str(folder.path)])
+            run = Run(learner, folder, loaded.spec.train.checkpoint, resume, state["seconds"] if state else 0.0)
             if ranks.is_first and run.board is None:
                 print(f"TensorBoard is not installed: the curve is in {folder.curve} alone")
             with learner_page(learner) if self.view and ranks.is_first else nullcontext():
                 run.learn_with_bar(self.iterations, self.minutes, loaded.spec.train.iterations)
             if ranks.is_first:
-                self._finish(learner, folder, origin, run)
+                with run.named_in_file_errors():
+                    self._finish(learner, folder, origin, run)
         finally:
             env.close()
 
@@ -129,7 +131,6 @@ class Train:
         """Write the policy, evaluate it unless the run was stopped, and say so."""
         from tgdsl.rl.playing.evaluation import evaluate
         from tgdsl.rl.playing.policy import policy_for, read_policy
-        from tgdsl.rl.train.run import end_if_stopped
 
         command = shlex.join(["tgdsl", *sys.argv[1:]])
         card = learner.card(origin, run.seconds, command)
@@ -137,8 +138,7 @@ class Train:
         folder.evaluation.unlink(missing_ok=True)  # of what the policy was before
         summary = f"{learner.iteration} iterations, {learner.samples:,} steps, {run.seconds / 60:.1f} min"
         print(f"policy: {folder.policy}, after {summary}")
-        again = ["tgdsl", "train", str(self.task), "--device", self.device, "--resume", str(folder.path)]
-        end_if_stopped(run, shlex.join(again))
+        run.end_if_stopped()
         if self.episodes:
             with StatusLine() as progress:
                 actor = policy_for(learner.env, read_policy(folder.policy))

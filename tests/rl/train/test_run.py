@@ -25,6 +25,7 @@ from tgdsl.rl.train.run import DivergedError, Run, restore
 
 EVERY = 1e-9
 """A checkpoint after each iteration."""
+RESUME = "tgdsl train task.yaml --resume run"
 
 
 def begun(base, name="run", every=EVERY, **overrides):
@@ -33,7 +34,7 @@ def begun(base, name="run", every=EVERY, **overrides):
     folder = RunFolder(base / name)
     folder.check(is_resumed=False)
     folder.begin(run_origin(loaded, learner.env, 0, {}, 1), loaded, learner.env)
-    return Run(learner, folder, every), learner
+    return Run(learner, folder, every, RESUME), learner
 
 
 def networks(learner):
@@ -309,7 +310,7 @@ base, place = Path(sys.argv[2]), sys.argv[3]
 learner, loaded = small_learner(base)
 folder = RunFolder(base / "run")
 folder.begin(run_origin(loaded, learner.env, 0, {}, 1), loaded, learner.env)
-run = Run(learner, folder, 1e-9)
+run = Run(learner, folder, 1e-9, "")
 run.learn(2, float("inf"))
 owner, name = {
     "rollout": (learner.env, "step"),
@@ -356,7 +357,7 @@ def test_a_run_that_is_killed_goes_on(tmp_path, place, iteration):
     restore(learner, state, folder.checkpoint)
     folder.begin(run_origin(loaded, learner.env, 0, {}, 1), loaded, learner.env)
     assert not [file for file in folder.path.iterdir() if file.name.startswith(".")]
-    Run(learner, folder, EVERY, state["seconds"]).learn(5, float("inf"))
+    Run(learner, folder, EVERY, RESUME, state["seconds"]).learn(5, float("inf"))
     assert [row["iteration"] for row in folder.rows()] == ["1", "2", "3", "4", "5"]
     assert read_checkpoint(folder.checkpoint)["iteration"] == 5
     assert len(json.loads(folder.run.read_text())["starts"]) == 2
@@ -382,7 +383,7 @@ def test_a_disk_that_is_full_is_named_before_a_run_begins(tmp_path):
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
     try:
         with pytest.raises(FileError, match=r"run/checkpoint\.pt: File too large"):
-            Run(learner, folder, EVERY)
+            Run(learner, folder, EVERY, RESUME)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, before)
@@ -439,7 +440,7 @@ def test_a_disk_that_fills_up_leaves_a_whole_checkpoint_and_says_how_to_go_on(tm
         raise FileError(file, "No space left on device")
 
     monkeypatch.setattr(learner, "iterate", full)
-    goes_on = r"No space left on device; .*checkpoint\.pt is whole, of iteration 1; --resume .*run goes on from it"
+    goes_on = rf"No space left on device; .*checkpoint\.pt is whole, of iteration 1; to go on: {RESUME}$"
     with pytest.raises(FileError, match=goes_on):
         run.learn(5, float("inf"))
     assert read_checkpoint(run._folder.checkpoint)["iteration"] == 1
@@ -455,6 +456,7 @@ def test_what_tensorboard_cannot_write_is_named(tmp_path, monkeypatch, name):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(run.board, name, full)
-    with pytest.raises(FileError, match=r"events\.out\.tfevents: No space left on device"):
+    goes_on = rf"events\.out\.tfevents: No space left on device; .*checkpoint\.pt is whole, .*to go on: {RESUME}$"
+    with pytest.raises(FileError, match=goes_on):
         run.learn(1, float("inf"))
     close()

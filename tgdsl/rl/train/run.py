@@ -96,11 +96,14 @@ def stop_requests() -> Iterator[list[signal.Signals]]:
 
 
 class Run:
-    """A run in its folder; `seconds` of learning do not count what it takes to make environments and to evaluate."""
+    """A run in its folder; `seconds` of learning do not count what it takes to make environments and to evaluate.
 
-    def __init__(self, learner: Learning, folder: RunFolder, every: float, seconds: float = 0.0):
+    `resume` is the command that goes on from its checkpoint.
+    """
+
+    def __init__(self, learner: Learning, folder: RunFolder, every: float, resume: str, seconds: float = 0.0):
         """Write the first checkpoint: a folder or disk that cannot take it is found now."""
-        self.learner, self._folder, self._every, self.seconds = learner, folder, every, seconds
+        self.learner, self._folder, self._every, self._resume, self.seconds = learner, folder, every, resume, seconds
         self._rate, self._samples, self._saved = 0.0, learner.samples, learner.iteration
         self.stopped_by: signal.Signals | None = None  # the signal that has ended `learn`
         self._writes = learner.ranks.is_first
@@ -140,19 +143,30 @@ class Run:
         Iterations get the share of the run that is over: of iterations, or if that is more, of time, what was learned before
         included: a run that was killed and goes on for the rest of its time goes on as if it had not been.
         """
-        try:
-            with stop_requests() as received:
+        with self.named_in_file_errors(), stop_requests() as received:
+            try:
                 self._iterate(iterations, seconds, show, received)
-            self.stopped_by = received[0] if received else None
+            finally:
+                if self.board is not None:
+                    with as_file_error(self._folder.board):
+                        self.board.close()
+        self.stopped_by = received[0] if received else None
+
+    @contextlib.contextmanager
+    def named_in_file_errors(self) -> Iterator[None]:
+        """Have errors of files that cannot be written name the last checkpoint, and the command that goes on from it."""
+        try:
+            yield
         except FileError as error:
-            checkpoint = f"{self._folder.checkpoint} is whole, of iteration {self._saved}"
-            raise FileError(
-                error.file, f"{error.reason}; {checkpoint}; --resume {self._folder.path} goes on from it"
-            ) from error
-        finally:
-            if self.board is not None:
-                with as_file_error(self._folder.board):
-                    self.board.close()
+            hint = f"{self._folder.checkpoint} is whole, of iteration {self._saved}; to go on: {self._resume}"
+            raise FileError(error.file, f"{error.reason}; {hint}") from error
+
+    def end_if_stopped(self) -> None:
+        """End the process if a signal has stopped the run, and say how to go on."""
+        if self.stopped_by is not None:
+            stopped = f"stopped by {self.stopped_by.name} after iteration {self.learner.iteration}"
+            print(f"{stopped}; to go on: {self._resume}", file=sys.stderr)
+            raise SystemExit(128 + self.stopped_by)
 
     def _iterate(self, iterations: int, seconds: float, show: Show | None, received: Sequence[signal.Signals]) -> None:
         learner, seconds_before = self.learner, self.seconds
@@ -219,13 +233,6 @@ def _board(folder: Path, done: int) -> Any:
         from torch.utils.tensorboard import SummaryWriter
 
         return SummaryWriter(str(folder), flush_secs=10, purge_step=done + 1 if done else None)
-
-
-def end_if_stopped(run: Run, command: str) -> None:
-    """End the process if a signal has stopped a run, and say how to go on."""
-    if run.stopped_by is not None:
-        print(f"stopped by {run.stopped_by.name} after iteration {run.learner.iteration}; to go on: {command}", file=sys.stderr)
-        raise SystemExit(128 + run.stopped_by)
 
 
 def state_of(learner: Learning, seconds: float) -> dict[str, Any]:
