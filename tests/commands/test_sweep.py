@@ -183,7 +183,7 @@ def test_a_trial_that_is_wrong_says_so_and_one_that_was_made_is_left_alone(base,
     assert "nowhere.yaml" in (base / "x" / "log.txt").read_text()
     assert not (base / "x" / "ended.json").exists()
     (base / "x" / "ended.json").write_text("{}")
-    assert run_trial(trial, str(base / "x")) == "was made before"
+    assert run_trial(trial, str(base / "x")) == "finished earlier"
     other = Trial("x", {"--seed": 1}, ("train", "nowhere.yaml", "--envs", "4"))
     what = "its folder holds a run of other settings, `tgdsl train nowhere.yaml --device cpu`; give another --out"
     assert run_trial(other, str(base / "x")) == f"failed: {what}"
@@ -247,7 +247,8 @@ def test_each_run_has_a_process_of_its_own(base, here, monkeypatch):
     code, out, error = here(base, "sweep", "sweep.yaml")
     assert (code, error) == (0, "")
     assert asked == [{"num_cpus": 2, "num_gpus": 0, "max_retries": 1, "max_calls": 1}]
-    assert out.splitlines() == ["1/2 seed=1: was seed=1", "2/2 seed=2: was seed=2"]
+    first = f"2 runs; log.txt in each folder of {(base / 'out/sweep').resolve()} has a run's progress"
+    assert out.splitlines() == [first, "1/2 seed=1: was seed=1", "2/2 seed=2: was seed=2"]
 
 
 def test_a_name_may_be_as_long_as_a_folders(base):
@@ -283,7 +284,7 @@ def test_two_workers_one_of_them_killed(base, here):
         starts.append(len(json.loads((folder / "run.json").read_text())["starts"]))
     assert sorted(starts) == [1, 2]
     code, out, error = here(base, "sweep", document.name, "--out", "runs")
-    assert code == 0 and out.count("was made before") == 2, error
+    assert code == 0 and out.count("finished earlier") == 2, error
     code, out, error = here(base, "sweep", write(base, {"--seed": [1]}, cpus=1e6).name)
     assert code == 2 and "a run takes 1e+06 processors and 0 GPUs, no machine has more than" in error
 

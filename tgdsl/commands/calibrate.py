@@ -29,14 +29,14 @@ Intervals = Annotated[
 
 @dataclass(frozen=True)
 class CalibrateSensor:
-    """Fit parameters of a document's sensors to recordings, which docs/how-to/calibrate.md describes."""
+    """Fit parameters of a document's sensors to recordings. docs/how-to/calibrate.md has the format of recordings."""
 
     document: tyro.conf.Positional[args.File]
     """The document; the search starts from its values."""
     recordings: Annotated[tyro.conf.Positional[tuple[Path, ...]], args.optional("RECORDING")]
     """The recordings, at least one: .npz files, or YAML documents of CSV files."""
-    fit: Annotated[tuple[str, ...], args.optional("SENSOR.FIELD")] = ()
-    """A parameter to fit, or with a range: skin.thickness="1 mm:9 mm". Without any, the document predicts the recordings."""
+    fit: Annotated[tuple[str, ...], args.optional("[SENSOR.FIELD[=RANGE] ...]")] = ()
+    """Parameters to fit; a range limits the search: skin.thickness="1 mm:9 mm". Default: none, only the error is measured."""
     compare: args.OptionalFile = None
     """A YAML file with `compare:`, a list of models to fit in turn and compare in one table; default: one model."""
     reading: Literal["none", "offset", "scale", "affine"] = "none"

@@ -32,7 +32,7 @@ OPTIONS = {"touch": "types", "placement": "placements", "noise": "noise", "resol
 class Distill:
     """Teach students by DAgger with the document's `distill` settings, and evaluate them; write students, curves and a table.
 
-    There is one per type, placement, noise and seed, all in one simulation per resolution.
+    Each combination of type, placement, noise and seed has a student. All students of a resolution share one simulation.
     """
 
     task: args.Task
@@ -50,8 +50,7 @@ class Distill:
     """Seeds per type, placement and noise; default: 3."""
     envs: args.OptionalInt = None
     """Environments per simulation; default: about 13824, a multiple of the number of students."""
-    device: str = "cuda"
-    """Device of physics, touch and networks: cuda or cpu."""
+    device: args.Device = "cuda"
     iterations: args.OptionalInt = None
     """Iterations per simulation, including earlier parts of the run; default: `distill.iterations` of the document."""
     minutes: args.OptionalFloat = None

@@ -68,7 +68,7 @@ class Schema:
     """Write the JSON Schema of documents and layouts, or of tasks, for completion and checks in editors."""
 
     tasks: bool = False
-    """Write the schema of tasks."""
+    """Write the schema of tasks instead of the one of documents and layouts."""
     out: args.OptionalOut = None
     """The file to write; default: tgdsl.schema.json, or tgdsl.task.schema.json."""
 
@@ -92,7 +92,7 @@ class Run:
     seconds: Seconds = 1.0
     controls: args.OptionalFile = None
     """An .npz file with recorded controls, an array `ctrl` (step, actuator) or (step, env, actuator); default: keyframes."""
-    num_envs: int = 1
+    num_envs: Annotated[int, tyro.conf.arg(aliases=["--envs"])] = 1
     """Number of environments; the table and the picture show the first."""
     substeps: args.OptionalInt = None
     """Physics steps per control step; default: the `substeps` of sensors that read blocks, or 5."""

@@ -56,7 +56,7 @@ class ExportDataset:
     """Logs: side of the hand, the prefix of link and joint names; default: names without a prefix."""
     lockstep: bool = False
     """Run faster than real time: the emulator waits for each step, a log is read as fast as possible."""
-    device: Annotated[str, tyro.conf.arg(metavar="DEVICE")] = "cpu"
+    device: args.DeviceName = "cpu"
     """Device of the environments: cpu or cuda."""
     seed: args.Seed = 0
     set: args.Overrides = ()

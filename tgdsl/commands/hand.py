@@ -101,7 +101,7 @@ class Tare:
     port: Port = None
     hand_id: HandId = None
     calibration: args.OptionalFile = None
-    """A calibration file whose tare is replaced; default: forces stay in counts."""
+    """A calibration file whose tare is replaced; default: a new calibration, whose forces stay in counts."""
     frames: int = 20
     """Number of readings to average, at least 5."""
     max_spread: float = 4.0

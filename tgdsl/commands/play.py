@@ -117,7 +117,7 @@ class Play:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Play episodes without exploration, equal for all policies; print the score with its 95 % interval, and the gait."""
+    """Play the same episodes for every policy, without exploration; print the score with its 95 % interval, and the gait."""
 
     task: args.Task
     policy: args.OptionalFile = None

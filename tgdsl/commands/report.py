@@ -35,7 +35,7 @@ class Bench:
     """Compare the package with all closed forms instead, and with the paper's formulas; needs a clone of the repository."""
     hard: bool = False
     """Run the numerical hard cases of all kinds instead; needs a clone of the repository."""
-    device: Annotated[str, tyro.conf.arg(metavar="DEVICE")] = "cpu"
+    device: args.DeviceName = "cpu"
     """Device of the sensors: cpu, cuda or cuda:1."""
     envs: Annotated[str, tyro.conf.arg(metavar="N,N…")] = "256"
     """Numbers of environments to time; plots show the largest."""

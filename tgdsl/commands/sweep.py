@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import tyro
+
 from tgdsl.commands.arguments import Document, OptionalOutFolder, optional
 from tgdsl.errors import TgdslError
 from tgdsl.files.write import atomic_write
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 class Sweep:
     """Run every combination of a sweep's settings, each in its own folder; a run whose worker dies continues on another."""
 
-    document: Document
+    document: Annotated[Document, tyro.conf.arg(help="The sweep's YAML document.")]
     address: Annotated[str | None, optional("ADDRESS")] = None
     """Address of a Ray cluster, as for ray.init; default: this machine, with all its cores and GPUs."""
     out: OptionalOutFolder = None
@@ -49,6 +51,7 @@ class Sweep:
                 raise TgdslError(f"{self.document}: {requirement}, {available}")
             work = ray.remote(num_cpus=spec.cpus, num_gpus=spec.gpus, max_retries=spec.retries, max_calls=1)(run_trial)
             waiting = {work.remote(trial, str(out / trial.name)): trial for trial in trials}
+            print(f"{len(trials)} runs; log.txt in each folder of {out} has a run's progress", flush=True)
             failed = 0
             while waiting:
                 (done, *_), _ = ray.wait(list(waiting))
@@ -77,7 +80,7 @@ def run_trial(trial: Trial, folder: str) -> str:
     if words_file.is_file() and (last_words := json.loads(words_file.read_text())) != list(trial.words):
         return f"failed: its folder holds a run of other settings, `tgdsl {shlex.join(last_words)}`; give another --out"
     if end.is_file():
-        return "was made before"
+        return "finished earlier"
     place.mkdir(parents=True, exist_ok=True)
     atomic_write(words_file, json.dumps(trial.words).encode())
     with (place / "log.txt").open("a") as log, redirect_stdout(log), redirect_stderr(log):

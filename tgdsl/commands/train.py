@@ -34,8 +34,8 @@ class Train:
     task: args.Task
     envs: args.OptionalInt = None
     """Environments per process; default: 8192, or the number of the resumed run."""
-    device: str = "cuda"
-    """Device of physics, touch and networks: cuda or cpu. With torchrun, each process takes one GPU."""
+    device: args.DeviceName = "cuda"
+    """Device of physics, touch and networks: cuda, cuda:1 or cpu. With torchrun, each process takes one GPU."""
     iterations: args.OptionalInt = None
     """Iterations of the whole run, including earlier parts; default: `train.iterations` of the document."""
     minutes: args.OptionalFloat = None
