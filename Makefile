@@ -8,6 +8,7 @@ READY := $(VENV)/.ready
 TORCH_INDEX ?=
 PIP = $(BIN)/pip install $$([ -t 2 ] || echo --quiet)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+VERSION = $(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
 
 ADAPTERS := .venv-adapters
 
@@ -75,8 +76,10 @@ bench: $(READY)
 	@$(BIN)/python benchmarks/module.py
 
 # These pages and the reference that is generated from the code, as HTML: open build/docs/index.html. A warning is an error.
+# Each version has its folder there, which stays until `make clean`; the sidebar switches between them.
 docs: $(READY)
-	@$(BIN)/python -m sphinx -b html -W --keep-going --quiet docs build/docs
+	@$(BIN)/python -m sphinx -b html -W --keep-going --quiet docs build/docs/$(VERSION)
+	@$(BIN)/python docs/_ext/tgdsl_docs/versions.py build/docs
 	@echo "build/docs/index.html"
 
 # Ten minutes of reading an emulated hand at the highest rate that its line allows; SOAK_SECONDS=60 for one.

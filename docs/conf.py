@@ -1,4 +1,4 @@
-"""Sphinx's configuration: `make docs` builds these pages, and the pages that `_ext/tgdsl_docs` generates, into build/docs."""
+"""Sphinx's configuration: `make docs` builds these pages, and those that `_ext/tgdsl_docs` generates, into build/docs."""
 
 import sys
 import tomllib
@@ -9,7 +9,7 @@ sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 from tgdsl_docs.links import ROOT
 
 project = "tgdsl"
-author = "The tgdsl authors"
+author = copyright = "The tgdsl authors"
 version = release = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
 
 extensions = [
@@ -37,8 +37,9 @@ python_maximum_signature_line_length = 100
 
 html_theme = "furo"
 html_title = f"tgdsl {version}"
+templates_path = ["_templates"]  # the version switcher
 html_static_path = ["_static"]
-html_css_files = ["pictures.css"]
+html_css_files = ["pages.css"]
 html_theme_options = {"navigation_with_keys": True}
 html_copy_source = False
 html_show_sphinx = False

@@ -2,7 +2,7 @@
 
 python examples/any_source.py --source simulation
 python examples/any_source.py --source emulator
-python examples/any_source.py --source xhand1:/dev/ttyUSB0 --calibration hand.yaml
+python examples/any_source.py --source xhand1:/dev/ttyUSB0 --calibration hand.calibration.yaml
 python examples/any_source.py --source press.npz
 
 A real hand is only read here: it moves if `connect` is given `motion=MotionLimits(...)`.

@@ -1,4 +1,4 @@
-"""The built pages: no warnings, and in a browser pictures are drawn and the search finds a page. Nothing is fetched."""
+"""The built pages: no warnings, and in a browser pictures, search and version switcher work. Nothing is fetched."""
 
 import os
 import shutil
@@ -12,6 +12,7 @@ from threading import Thread
 
 import pytest
 
+import tgdsl
 from tgdsl.sensors import KINDS
 
 pytestmark = pytest.mark.slow
@@ -26,11 +27,12 @@ def built(tmp_path_factory):
     for name in SOURCES:
         (folder / name).symlink_to(REPOSITORY / name)
     shutil.copytree(REPOSITORY / "docs", folder / "docs", ignore=shutil.ignore_patterns("generated", "__pycache__"))
-    command = [sys.executable, "-m", "sphinx", "-b", "html", "-W", "--keep-going", "--quiet", "docs", "build"]
+    built = folder / "site" / tgdsl.__version__
+    command = [sys.executable, "-m", "sphinx", "-b", "html", "-W", "--keep-going", "--quiet", "docs", built]
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
     ran = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
-    return folder / "build"
+    return built
 
 
 WITH_PICTURES = (
@@ -69,7 +71,21 @@ def test_pages_are_built_pictures_drawn_and_words_found(built):
     for source in (page for page in pages if "generated" not in page.parts):
         assert (built / source.relative_to(REPOSITORY / "docs").with_suffix(".html")).is_file()
     assert 'href="../../_modules/tgdsl/' in (built / "generated" / "api" / "functions.html").read_text(encoding="utf-8")
-    with browser_of(built) as (tab, address):
+    site, older = built.parent, built.parent / "0.0.9"
+    older.mkdir()
+    for name in ("index.html", "objects.inv"):
+        shutil.copy(built / name, older)
+    subprocess.run([sys.executable, REPOSITORY / "docs/_ext/tgdsl_docs/versions.py", site], check=True)
+    with browser_of(site) as (tab, root):
+        address = f"{root}/{tgdsl.__version__}"
+        tab.goto(root)
+        tab.wait_for_url(f"{address}/index.html")
+        tab.goto(f"{address}/background/sound.html")
+        switcher = tab.locator(".version-switcher select")
+        assert switcher.locator("option").all_inner_texts() == [tgdsl.__version__, "0.0.9"]
+        assert switcher.locator("option:checked").inner_text() == tgdsl.__version__
+        switcher.select_option(label="0.0.9")
+        tab.wait_for_url(f"{root}/0.0.9/index.html")
         for name in WITH_PICTURES:
             tab.goto(f"{address}/{name}.html", wait_until="load")
             widths = tab.eval_on_selector_all(".content img, article img", "images => images.map(image => image.naturalWidth)")

@@ -13,8 +13,8 @@ import tyro
 
 from tgdsl.commands.cli import Command, example_of
 
-WIDTH = "110"
-"""Columns of the help."""
+WIDTH = "90"
+"""Columns of the help: those of a block of code in a page."""
 
 
 def command_pages() -> dict[str, str]:
