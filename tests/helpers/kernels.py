@@ -37,7 +37,23 @@ def use_kernels() -> None:
     """Have operations of this process launch kernels for float32 on the CPU, as they do on a GPU."""
     if os.environ.get("TRITON_INTERPRET"):
         torch.library.wrap_triton = lambda kernel: kernel  # only torch.compile wants it; older torch takes no interpreted one
+        patch_language_once()
     operations.are_kernel_inputs = lambda *tensors: all(tensor.dtype == torch.float32 for tensor in tensors)
+
+
+def patch_language_once() -> None:
+    """Leave `triton.language` patched: the interpreter takes half of its time to do that at each call of a function in a kernel."""
+    from triton.runtime import interpreter
+
+    patch, patched = interpreter._patch_lang, set()
+
+    def patch_once(function):
+        if function.__module__ not in patched:
+            patched.add(function.__module__)
+            patch(function)
+        return interpreter._LangPatchScope()  # has nothing to restore
+
+    interpreter._patch_lang = patch_once
 
 
 class AbsentGpu:

@@ -20,7 +20,7 @@ PALM = Path(__file__).parents[3] / "examples" / "xhand1_palm.yaml"
 STICKS, SLIDES = StickSlip(1e-3, 1e-5, 1e-3, None), StickSlip(1e-3, 1e-5, 1e-3, 0.4)
 CONTACT_LAWS = {"sticks": STICKS, "slides": SLIDES}
 CASES = ("one link", "cubes", "many points")
-STEPS, BEFORE = 5, 7
+STEPS, BEFORE = 4, 7
 """Steps of a run, and how many points of other objects stand before those that are looked at."""
 PLACE, STRENGTH = 3e-7, 3e-9
 """Errors of places [m], and of their products with depths [m²], in float32."""
