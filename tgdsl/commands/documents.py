@@ -309,8 +309,7 @@ class Verify:
             raise ArtifactError(f"{self.file}: does not say what it was exported from; name it with --of")
         with StatusLine() as progress:
             touch = args.module_of(self.of or Path(signature.source), () if self.of else signature.overrides, progress)
-            progress("comparing")
-            verdict = verify(self.file, touch, self.calls)
+            verdict = verify(self.file, touch, self.calls, progress)
         for num_envs, differences in verdict.differences.items():
             print(f"{num_envs} environments, {self.calls} calls")
             for name, value in differences.items():

@@ -75,7 +75,7 @@ def test_another_side_and_region(tmp_path):
     assert len(taxels["palm"]) == 4 * 8 * 6  # 8 × 6 cm
     np.testing.assert_allclose(taxels["palm"]["normal"] @ [0, 0, 1], 1.0)
     text = lines_of(draft)
-    assert text[0].endswith("and changed by hand; comments mark what is guessed.")
+    assert text[0].endswith("and changed by hand; comments mark the guesses.")
     assert text[[line.startswith("    left_tip: {method") for line in text].index(True)].endswith(
         "region: {facing: [-1, 0, 0], within: 75 deg}}"
     )
@@ -100,7 +100,7 @@ def test_links_in_and_out_of_groups(tmp_path):
     write_layout(draft, tmp_path / "layout.yaml")
     text = (tmp_path / "layout.yaml").read_text()
     assert "  tips: [palm, left_tip]\n" in text and "  hand: [fingers]\n" in text and "palm: [" not in text
-    assert "guessed: the last" not in text and "  # all that moves" in text
+    assert "guessed: the last" not in text and "  # all links that move" in text
     groups = compiled(tmp_path, {"hand": "geometric", "tips": "geometric"}).plan.layout.groups
     expected = {"tips": {"palm", "left_tip"}, "fingers": {"left", *TIPS, "right"}, "hand": {"left", *TIPS, "right"}}
     assert {name: set(links) for name, links in groups.items()} == expected

@@ -41,8 +41,8 @@ def test_every_taxel_can_feel(tmp_path, here, side):
             "finger": ("mesh", True),
             "thumb": ("collision", False),
         }
-    hull = "on what the simulator collides: the surface itself lies deeper in it than taxels feel"
-    exposed = "without what is inside other colliding geoms in the initial state"
+    hull = "on the collision geometry: the surface is deeper inside it than taxels reach"
+    exposed = "without the parts that are inside other collision geoms in the initial state"
     assert f"    # {hull}\n    # {exposed}\n    palm: {{method: poisson, count: " in text
     assert "surface: collision, exposed: true" in text
     lines = said.splitlines()
@@ -74,8 +74,8 @@ def test_a_link_that_others_cover_is_left_out(tmp_path, here):
 def test_a_robot_of_which_nothing_is_collided_keeps_its_taxels_and_says_so(tmp_path, here):
     """They feel by distance, so they are kept; what cannot be felt by contact is named."""
     text, said = proposed(tmp_path, here, HANDS["visual"].text)
-    mind = "the simulator collides none of these links, so taxels feel with `gate: geometric` alone"
-    assert f"# Mind: {mind}.\n" in text and f"not collided: {mind}" in said.splitlines()
+    mind = "none of these links collides in the simulator, so their taxels need `gate: geometric`"
+    assert f"# Note: {mind}.\n" in text and f"not collided: {mind}" in said.splitlines()
     assert "surface:" not in text and "exposed:" not in text
     found = unfelt(tmp_path)["med"]
     assert len(found) == 2 and all("on a body that the simulator does not collide" in own for own in found)

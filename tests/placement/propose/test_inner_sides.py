@@ -297,7 +297,7 @@ def test_radians_that_were_read_as_degrees(tmp_path, here):
     np.testing.assert_allclose([*ends.values()], [np.radians((1.05, 0.0))] * 3, rtol=0, atol=1e-12)
     code, said, _ = here(tmp_path, "layout", "new", "hand.xml")
     line = "no hinge of this robot turns by more than 6.28 degrees: its limits look like radians"
-    assert code == 0 and f"limits: {line}" in said and f"# Mind: {line}" in (tmp_path / "layout.yaml").read_text()
+    assert code == 0 and f"limits: {line}" in said and f"# Note: {line}" in (tmp_path / "layout.yaml").read_text()
 
 
 def test_a_covered_tip_is_no_part_of_a_hand(tmp_path):

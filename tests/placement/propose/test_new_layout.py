@@ -129,7 +129,7 @@ def test_a_shared_name_is_told(tmp_path, here):
     text = FOUR_BAR.replace('name="left_rubber"', 'name="right_finger"')
     (tmp_path / "hand.xml").write_text(text)
     here(tmp_path, "layout", "new", "hand.xml")
-    line = "# Mind: geoms or meshes of other links are also called right_finger; a selection by that name takes both.\n"
+    line = "# Note: geoms or meshes of other links are also called right_finger; a selection by that name takes both.\n"
     assert line in (tmp_path / "layout.yaml").read_text()
 
 

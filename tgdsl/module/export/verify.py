@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from tgdsl.errors import ArtifactError, TgdslError
+from tgdsl.console.progress import Progress, silent
+from tgdsl.errors import ArtifactError, TgdslError, listed
 from tgdsl.module.export import standalone
 from tgdsl.module.export.program import Signature, read_signature
 from tgdsl.module.module import TactileModule
@@ -46,7 +47,7 @@ class Verdict:
         return self.worst <= TOLERANCE and self.refuses_other_dtypes
 
 
-def verify(path: Path, touch: TactileModule, num_calls: int = NUM_CALLS) -> Verdict:
+def verify(path: Path, touch: TactileModule, num_calls: int = NUM_CALLS, progress: Progress = silent) -> Verdict:
     """Compare an exported file with its module, on the CPU, on random states, in a process that cannot import tgdsl.
 
     The module is seeded as at the export. Memory is carried from call to call, and some environments begin an episode at every
@@ -58,7 +59,8 @@ def verify(path: Path, touch: TactileModule, num_calls: int = NUM_CALLS) -> Verd
     if path.suffix == ".onnx" and not find_spec("onnxruntime"):
         raise TgdslError('to run ONNX files takes onnxruntime: pip install "tgdsl[export]"')
     with tempfile.TemporaryDirectory() as folder:
-        records = [_record(signature, touch, num_envs, num_calls, Path(folder)) for num_envs in BATCHES]
+        records = [_record(signature, touch, num_envs, num_calls, Path(folder), progress) for num_envs in BATCHES]
+        progress(f"calling the file, {num_calls} times with {listed(map(str, BATCHES))} environments")
         command = [sys.executable, "-I", standalone.__file__, str(path.absolute()), *map(str, records)]
         run = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     if run.returncode:
@@ -67,12 +69,15 @@ def verify(path: Path, touch: TactileModule, num_calls: int = NUM_CALLS) -> Verd
     return Verdict(dict(zip(BATCHES, answer["differences"], strict=True)), answer["refuses"])
 
 
-def _record(signature: Signature, touch: TactileModule, num_envs: int, num_calls: int, folder: Path) -> Path:
+def _record(
+    signature: Signature, touch: TactileModule, num_envs: int, num_calls: int, folder: Path, progress: Progress
+) -> Path:
     """Write what the module reads of random states, and the states."""
     arrays: dict[str, np.ndarray] = {"num_calls": np.array(num_calls), "num_envs": np.array(num_envs)}
     dtypes = {port.name: getattr(torch, port.dtype) for port in signature.inputs}
     memory, generator = touch.initial_memory(num_envs, signature.dt), torch.Generator().manual_seed(num_envs)
     for call in range(num_calls):
+        progress(f"calling the module with {num_envs} environments: {call + 1} of {num_calls}")
         state = touch.example_state(num_envs, call, dtypes["body_pos"], SPREAD)
         state = dataclasses.replace(state, dt=signature.dt)
         reset = (torch.rand(num_envs, generator=generator) < 0.3) & (call % RESET_EVERY == RESET_EVERY - 1)

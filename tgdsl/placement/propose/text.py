@@ -24,26 +24,26 @@ _KEYWORDS = {"null", "true", "false", "yes", "no", "on", "off", "y", "n"}
 _HEADER = """\
 # A layout for {robot}, proposed by `tgdsl layout new`{looked}.
 # Density: {density:g} taxels per cm² at `med`, a quarter of that at `low`, four times as much at `high`; at least 1 a link.
-# `radius` is how far a taxel feels: neighbours overlap a little. To edit: drop links that are not to feel, move links
-# between groups, and give a region (facing, box, sphere, geoms), or `method: grid`, where all around is not what you want.
-# A document takes it as `robot: {{model: ..., layout: THIS FILE}}` and says which resolution with `resolution: med`.
+# `radius` is the reach of a taxel: neighbours overlap a little. To edit: remove links that need no taxels, move links
+# between groups, and give a region (facing, box, sphere, geoms) or `method: grid` where taxels should not be all around.
+# A document uses this file by `robot: {{model: ..., layout: THIS FILE}}`, and picks a resolution by `resolution: med`.
 """
 _ABOUT = {
     "tips": "guessed: the last links of all chains, and what a single jaw closes on",
     "palm": "guessed: the largest link from which the chains part, and parts of it",
-    "fingers": "all that moves against it",
-    "hand": "the fingers, the palm and what is fixed to it",
+    "fingers": "all links that move against the palm",
+    "hand": "the fingers, the palm and links fixed to it",
 }
 _OPTIONS = {
-    "surface": "on what the simulator collides: the surface itself lies deeper in it than taxels feel",
-    "exposed": "without what is inside other colliding geoms in the initial state",
+    "surface": "on the collision geometry: the surface is deeper inside it than taxels reach",
+    "exposed": "without the parts that are inside other collision geoms in the initial state",
 }
-_NOT_COLLIDED = "the simulator collides none of these links, so taxels feel with `gate: geometric` alone"
+_NOT_COLLIDED = "none of these links collides in the simulator, so their taxels need `gate: geometric`"
 _MISREAD = (
     "no hinge of this robot turns by more than 6.28 degrees: its limits look like radians, and its file lacks "
-    '`<compiler angle="radian"/>`; sides are guessed as if it said so, but the simulator keeps to the limits as they are'
+    '`<compiler angle="radian"/>`; inner sides are guessed in radians, but the simulator uses the limits as they stand'
 )
-_UNSEEN, _CHANGED = ": nobody has looked at it yet", " and changed by hand; comments mark what is guessed"
+_UNSEEN, _CHANGED = ": not checked yet", " and changed by hand; comments mark the guesses"
 _NO_PALM = "  # no palm: the chains part from nothing that has a surface, or there is only one chain\n"
 
 USUAL_DENSITY = (100.0, math.inf)  # below one per dm² another unit was most likely meant [1/m²]
@@ -97,7 +97,7 @@ def write_layout(draft: Draft, out: Path) -> list[str]:
         *(f"{option}: {listed([link.name for link in links])}: {_OPTIONS[key]}" for key, option, links in _options(proposal)),
         *([] if proposal.is_collided else [f"not collided: {_NOT_COLLIDED}"]),
         *([f"limits: {_MISREAD}"] if proposal.is_misread else []),
-        f"{out}: every guess in it is marked; please look at them",
+        f"{out}: comments mark every guess; check them",
     ]
 
 
@@ -107,11 +107,11 @@ def layout_text(proposal: Proposal, robot: str) -> str:
     looked = _CHANGED if is_changed else _UNSEEN
     parts = [_HEADER.format(robot=quoted(robot), looked=looked, density=proposal.density * 1e-4)]
     parts += [f"# Left out: {line}\n" for line in _by_reason(proposal.left_out)]
-    parts += [] if proposal.is_collided else [f"# Mind: {_NOT_COLLIDED}.\n"]
-    parts += [f"# Mind: {_MISREAD}.\n"] if proposal.is_misread else []
+    parts += [] if proposal.is_collided else [f"# Note: {_NOT_COLLIDED}.\n"]
+    parts += [f"# Note: {_MISREAD}.\n"] if proposal.is_misread else []
     if proposal.groups and proposal.shared:
         names = ", ".join(map(quoted, proposal.shared))
-        parts.append(f"# Mind: geoms or meshes of other links are also called {names}; a selection by that name takes both.\n")
+        parts.append(f"# Note: geoms or meshes of other links are also called {names}; a selection by that name takes both.\n")
     parts += ["tgdsl: 1\n", _groups_text(proposal), "resolutions:\n"]
     for resolution in FACTORS:
         total = sum(link.counts[resolution] for link in proposal.links)
