@@ -102,6 +102,7 @@ def arguments(case, dtype):
     """Return the arguments of `shared_forces` in a dtype."""
     bodies, _, depth, *rest = case
     vectors = [tuple(torch.tensor(value, dtype=dtype) for value in part) for part in rest[:4]]
+    net = tuple(part.sum(dim=-1) for part in vectors[1])
     radius, levenberg = (torch.tensor(value, dtype=dtype) for value in rest[4:])
     floats = {name: value.to(dtype) for name, value in vars(bodies).items() if value.is_floating_point()}
-    return dataclasses.replace(bodies, **floats), torch.tensor(depth, dtype=dtype), *vectors, radius, levenberg
+    return dataclasses.replace(bodies, **floats), torch.tensor(depth, dtype=dtype), *vectors, net, radius, levenberg

@@ -316,8 +316,23 @@ def test_blocks_are_tiles_where_a_taxel_asks_for_little(document, name):
     sensor, is_tiled = TILES[name]
     document["sensors"] = {"mine": {"links": "pad", "feels": ["item"], **sensor}}
     options = tgdsl.compile(document).inductor_options()
-    tiles = {"triton.prefer_nd_tiling": is_tiled, "triton.enable_pdl": is_tiled, "triton.autotune_pointwise": not is_tiled}
-    assert options == {"assert_indirect_indexing": False} | tiles
+    tiles = {"triton.prefer_nd_tiling": is_tiled, "triton.enable_pdl": is_tiled, "coordinate_descent_tuning": is_tiled}
+    assert options == {"assert_indirect_indexing": False, "triton.autotune_pointwise": not is_tiled} | tiles
+
+
+def test_the_number_of_environments_is_the_only_size_that_a_compiled_module_does_not_know(document):
+    document["sensors"] = {"mine": {"links": "pad", "feels": ["item"], "kind": "force_taxel", "noise": {"read_delay": "5 ms"}}}
+    touch, unknown = tgdsl.compile(document), []
+
+    def keep(graph, inputs):
+        unknown.append([size for size in inputs if isinstance(size, torch.SymInt)])
+        return graph
+
+    touch.compile(backend=keep)
+    for num_envs in (5, 11):
+        touch.free()
+        touch(touch.example_state(num_envs))
+    assert [len(sizes) for sizes in unknown] == [1]
 
 
 @pytest.mark.slow

@@ -243,11 +243,11 @@ class Memory(HookedModule):
         """Plan the buffers; `kinds` by sensor, where their warnings are wanted."""
         super().__init__()
         self._watch = StateWatch(sensors, kinds or {})
-        self._planned = {f"{s.name}:{name}": part for s in sensors for name, part in s.state.items()}
+        self.planned = {f"{s.name}:{name}": part for s in sensors for name, part in s.state.items()}
         windows = [(s.history, reading) for s in sensors if s.history is not None for reading in s.windows]
         for history, reading in windows:
             shape = (history.length, len(reading.channels), reading.num_rows)
-            self._planned[f"{WINDOW}{reading.name}"] = PlannedMemory(0.0, shape)
+            self.planned[f"{WINDOW}{reading.name}"] = PlannedMemory(0.0, shape)
         self._restarted = {f"{s.name}:{n}": part.rest for s in sensors for n, part in s.state.items() if "/" not in n}
         self._rings = {f"{s.name}:{n}": (s.sensor, part) for s in sensors for n, part in s.state.items() if part.past > 0}
         stacks = {reading.name for _, reading in windows if reading.steps}  # their windows hold them already
@@ -265,7 +265,7 @@ class Memory(HookedModule):
     @property
     def is_wanted(self) -> bool:
         """Whether any sensor carries something."""
-        return bool(self._planned) or self.clock.is_wanted
+        return bool(self.planned) or self.clock.is_wanted
 
     @property
     def num_envs(self) -> int | None:
@@ -282,7 +282,7 @@ class Memory(HookedModule):
         """Return all buffers by name; at the first call they are allocated, as ordinary tensors even under `inference_mode`."""
         with torch.inference_mode(False):
             if self.is_wanted and self.num_envs is None:
-                for path, planned in self._planned.items():
+                for path, planned in self.planned.items():
                     shape = (num_envs, *_calls(planned, dt), *planned.shape)
                     self.register_buffer(path, torch.full(shape, planned.rest, dtype=dtype, device=device))
                 if self.clock.is_wanted:
@@ -303,9 +303,9 @@ class Memory(HookedModule):
             problem = f"memory: found {type(memory).__name__}"
             raise StateError(f"{problem}, expected `initial_memory`, or what the step before returned")
         clock = ("clock/age", "clock/step") if self.clock.is_wanted else ()
-        if missing := [name for name in (*self._planned, *clock) if name not in memory]:
+        if missing := [name for name in (*self.planned, *clock) if name not in memory]:
             raise StateError(f'memory: found no "{missing[0]}"; expected `initial_memory`, or what the step before returned')
-        for name, planned in self._planned.items():
+        for name, planned in self.planned.items():
             shape, rest = tuple(memory[name].shape), (*(("call",) if planned.past else ()), *planned.shape)
             if shape[0] != num_envs or len(shape) != len(rest) + 1 or shape[len(shape) - len(planned.shape) :] != planned.shape:
                 expected = ", ".join(map(str, (num_envs, *rest)))
@@ -385,9 +385,7 @@ class Memory(HookedModule):
 
         Buffers that have the shape already stay where they are: captured graphs go on with them.
         """
-        loaded = {
-            path: state_dict[prefix + path] for path in self._planned if isinstance(state_dict.get(prefix + path), Tensor)
-        }
+        loaded = {path: state_dict[prefix + path] for path in self.planned if isinstance(state_dict.get(prefix + path), Tensor)}
         age = state_dict.get(f"{prefix}clock.age")
         if loaded or age is not None:
             errors.extend(self._misfits(loaded, age, prefix))
@@ -402,14 +400,14 @@ class Memory(HookedModule):
 
     def _misfits(self, found: Mapping[str, Tensor], age: Tensor | None, prefix: str) -> list[str]:
         """Return what is wrong with state that is to be loaded: parts that lack, or are not of the planned shape."""
-        missing = [path for path in self._planned if path not in found]
+        missing = [path for path in self.planned if path not in found]
         missing += ["clock.age"] if self.clock.is_wanted and age is None else []
         wrong = [f'"{prefix}{path}" is missing beside other state' for path in missing]
         counts = {len(value) for value in [*found.values(), *([] if age is None else [age])] if value.ndim}
         if len(counts) > 1:
             wrong.append(f'the parts of "{prefix}" are of {sorted(counts)} environments')
         for path, value in found.items():
-            shape, expected = tuple(value.shape), tuple(self._planned[path].shape)
+            shape, expected = tuple(value.shape), tuple(self.planned[path].shape)
             if shape[value.ndim - len(expected) :] != expected:
                 wrong.append(f'"{prefix}{path}" has shape {shape}, expected (env, …, {", ".join(map(str, expected))})')
         return wrong

@@ -27,7 +27,7 @@ from tgdsl.module.export.program import EXAMPLE_ENVS, Signature, Step, export_st
 from tgdsl.module.memory import Memory, chosen_rows, kept, store, stored
 from tgdsl.module.outputs import ObservationTerm, Output, observation_terms, observe, outputs_of
 from tgdsl.module.sensing import Sensing, bind, constant_arrays, in_order, sense
-from tgdsl.module.state import Incoming, SceneState, example_state
+from tgdsl.module.state import SHAPES, Incoming, SceneState, example_state, shape_of
 from tgdsl.module.taxels import SavedTaxels, images_of, row_tables, taxel_table
 from tgdsl.observations.observations import types_of
 from tgdsl.plan.inputs import Inputs
@@ -38,7 +38,7 @@ from tgdsl.sensors.noise.pipeline import stages_of
 from tgdsl.tensors.buffers import Constants
 from tgdsl.tensors.devices import check_dtype, dtype_of
 from tgdsl.tensors.env_ids import EnvIds, check_env_ids, env_mask
-from tgdsl.tensors.torch_internals import HookedModule
+from tgdsl.tensors.torch_internals import HookedModule, fix_sizes
 
 
 class TactileModule(HookedModule):
@@ -316,6 +316,11 @@ class TactileModule(HookedModule):
         return readings, copies | updated
 
     def _read(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        if torch.compiler.is_compiling():  # then loops over slots and components are unrolled
+            for name in filter(SHAPES.__contains__, tensors):
+                fix_sizes(tensors[name], shape_of(name, self.inputs))
+            for name, planned in self.memory.planned.items():
+                fix_sizes(memory[name], planned.shape)
         sensing = Sensing(self.plan, self._kinds, self._quantities, self._stages, self.memory.clock, self._order)
         return sense(sensing, self.constants.tree, tensors, memory, self.dtype)
 

@@ -152,8 +152,12 @@ def _completed(whole: Vec, force: Vec, is_used: Bool[Tensor, "env body object sl
 
 
 def _of_pairs(field: Tensor, index: Int[Tensor, "body object"]) -> Tensor:
-    padding = field.new_zeros((field.shape[0], 1, *field.shape[2:]))
-    return torch.cat([field, padding], dim=1).index_select(1, index.flatten()).unflatten(1, index.shape)
+    num_pairs = field.shape[1]
+    if num_pairs == 0:
+        return field.new_zeros((field.shape[0], *index.shape, *field.shape[2:]))
+    is_pair = (index < num_pairs).reshape(*index.shape, *[1] * (field.ndim - 2))
+    rows = field.index_select(1, index.clamp(max=num_pairs - 1).flatten()).unflatten(1, index.shape)
+    return torch.where(is_pair, rows, 0.0)
 
 
 @dataclass(frozen=True, eq=False)

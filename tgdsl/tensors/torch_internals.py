@@ -149,15 +149,26 @@ def inductor_options(checks_indices: bool, has_tiles: bool, is_fused: bool) -> d
     Kernels may assert that indices read from tensors are in range; on a GPU have tiles of 32 × 32 of two axes, not blocks of
     one flat axis; and have as many operations as can be, instead of 64 at most.
     """
-    # Sizes of blocks are chosen by timing, but of a kernel that takes 10 µs that is the time of its launch. From Hopper on each
+    # Sizes of blocks are chosen by timing, but of a kernel that takes 10 µs that is the time of its launch. Of a sum over slots
+    # it may choose one row a block, which takes 48 µs for 6, unless coordinate descent goes on from there. From Hopper on each
     # kernel with tiles is launched while the one before it ends (programmatic dependent launch).
     options: dict[str, Any] = {
         "assert_indirect_indexing": checks_indices,
         "triton.prefer_nd_tiling": has_tiles,
         "triton.autotune_pointwise": not has_tiles,
+        "coordinate_descent_tuning": has_tiles,
         "triton.enable_pdl": has_tiles,
     }
     return options | {"max_fusion_size": 1024} if is_fused else options
+
+
+def fix_sizes(tensor: Tensor, sizes: Sequence[int]) -> None:
+    """Let torch.compile take the last sizes of a tensor for these constants, where it traces with dynamic shapes.
+
+    `torch._check` is documented, but has no public name.
+    """
+    for size, wanted in zip(tensor.shape[tensor.ndim - len(sizes) :], sizes, strict=True):
+        torch._check(size == wanted)
 
 
 def expect_size(size: torch.SymInt, value: int) -> torch.SymInt:

@@ -60,7 +60,7 @@ def verify(path: Path, touch: TactileModule, num_calls: int = NUM_CALLS, progres
         raise TgdslError('to run ONNX files takes onnxruntime: pip install "tgdsl[export]"')
     with tempfile.TemporaryDirectory() as folder:
         records = [_record(signature, touch, num_envs, num_calls, Path(folder), progress) for num_envs in BATCHES]
-        progress(f"calling the file, {num_calls} times with {listed(map(str, BATCHES))} environments")
+        progress(f"calling the file, {num_calls} times with {listed([str(num) for num in BATCHES])} environments")
         command = [sys.executable, "-I", standalone.__file__, str(path.absolute()), *map(str, records)]
         run = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     if run.returncode:

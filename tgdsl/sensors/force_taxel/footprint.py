@@ -137,7 +137,7 @@ class Shared(NamedTuple):
     """What contacts' forces become."""
 
     force: Float[Tensor, "env 3 taxel"]  # force on each taxel, Σ_c γ_c λ_cj f_c [N]
-    carried: Float[Tensor, "env 3 body"]  # their sum over each body's taxels [N]
+    missed: Float[Tensor, "env 3 body"]  # each body's net force less their sum over its taxels [N]
     residual: Float[Tensor, "env 3 body"]  # what they leave of the moment [N·m]
 
 
@@ -148,6 +148,7 @@ def shared_forces(
     force: Vec,
     torque: Vec,
     normal: Vec,
+    net: Vec,
     radius: Float[Tensor, " body"],
     levenberg: Float[Tensor, " iteration"],
 ) -> Shared:
@@ -160,6 +161,7 @@ def shared_forces(
         force: Forces on the body [N].
         torque: Torques on the body at the contact points [N·m].
         normal: Unit normals out of the objects.
+        net: Net forces on the bodies, planes (env, body) [N].
         radius: Radius of a footprint r_f [m].
         levenberg: Least curvature of each step towards the moment [1]; of length 0 it leaves λ⁰.
     """
@@ -180,25 +182,42 @@ def shared_forces(
     )
     padded = [(share * part[..., None]).sum(dim=2) for part in force]
     result = torch.stack([part.flatten(1).index_select(1, bodies.row) for part in padded], dim=1)
-    return Shared(result, torch.stack([part.sum(dim=2) for part in padded], dim=1), torch.stack(residual, dim=1))
+    missed = torch.stack(net, dim=1) - torch.stack([part.sum(dim=2) for part in padded], dim=1)
+    return Shared(result, missed, torch.stack(residual, dim=1))
 
 
 def _shared_by_kernel(
-    bodies: Bodies[Tensor], depth: Tensor, point: Vec, force: Vec, torque: Vec, normal: Vec, radius: Tensor, levenberg: Tensor
+    bodies: Bodies[Tensor],
+    depth: Tensor,
+    point: Vec,
+    force: Vec,
+    torque: Vec,
+    normal: Vec,
+    net: Vec,
+    radius: Tensor,
+    levenberg: Tensor,
 ) -> Shared:
     from tgdsl.sensors.force_taxel import footprint_kernel
 
     inverse_radius = bodies.inverse_radius.flatten()[bodies.row]
     weight = torch.log2(depth * inverse_radius + unreached())
     args = radius, levenberg, bodies.first, bodies.box
-    shared, sums = footprint_kernel.shared_forces(bodies.place, weight, point, force, torque, normal, *args)
+    shared, sums = footprint_kernel.shared_forces(bodies.place, weight, point, force, torque, normal, net, *args)
     return Shared(shared, sums[:, :3], sums[:, 3:])
 
 
 def _inputs(
-    bodies: Bodies[Tensor], depth: Tensor, point: Vec, force: Vec, torque: Vec, normal: Vec, radius: Tensor, levenberg: Tensor
+    bodies: Bodies[Tensor],
+    depth: Tensor,
+    point: Vec,
+    force: Vec,
+    torque: Vec,
+    normal: Vec,
+    net: Vec,
+    radius: Tensor,
+    levenberg: Tensor,
 ) -> list[Tensor]:
-    return [depth, *point, *force, *torque, *normal]
+    return [depth, *point, *force, *torque, *normal, *net]
 
 
 SHARED_FORCES = Operation("shared_forces", shared_forces, _shared_by_kernel, _inputs)

@@ -47,6 +47,7 @@ def shared_forces(
     force: Sequence[Tensor],
     torque: Sequence[Tensor],
     normal: Sequence[Tensor],
+    net: Sequence[Tensor],
     radius: Tensor,
     levenberg: Tensor,
     first: Tensor,
@@ -54,7 +55,7 @@ def shared_forces(
 ) -> tuple[Tensor, Tensor]:
     """Return the force on each taxel, (env, 3, taxel) [N], and two vectors of each body, (env, 6, body).
 
-    These are the sum of its taxels' forces [N], and what they leave of the moment [N·m].
+    These are what its taxels' forces leave of the net force [N] and of the moment [N·m].
 
     Args:
         pos: Taxel positions in their body's frame [m], inactive ones far away, and −2 times their normals: (taxel, 6).
@@ -63,6 +64,7 @@ def shared_forces(
         force: Forces on the body [N].
         torque: Torques on the body at the contact points [N·m].
         normal: Unit normals out of the objects.
+        net: Net forces on the bodies, three planes (env, body) [N].
         radius: Radius of a footprint, (body,) [m].
         levenberg: Least curvature of each step towards the moment [1].
         first: First taxel of each body, and the number of all: (body + 1,).
@@ -72,7 +74,7 @@ def shared_forces(
     num_taxels = weight.shape[1]
     shared = weight.new_empty((num_envs, 3, num_taxels))
     sums = weight.new_empty((num_envs, 6, num_bodies))
-    planes = [plane.contiguous() for plane in (pos, weight, *point, *force, *torque, *normal)]
+    planes = [plane.contiguous() for plane in (pos, weight, *point, *force, *torque, *normal, *net)]
     wrap_triton(footprint_kernel)[(triton.cdiv(num_envs, ENVS), num_bodies)](
         *planes, radius, levenberg, first, box, shared, sums, num_envs, num_bodies, num_contacts, num_taxels,
         STEPS=levenberg.shape[0], FEW=FEW_STEPS, ENVS=ENVS, GROUP=GROUP, TILE=TILE, num_warps=1,
@@ -83,7 +85,8 @@ def shared_forces(
 @triton.jit
 def footprint_kernel(
     pos, weight, point_x, point_y, point_z, force_x, force_y, force_z, torque_x, torque_y, torque_z,
-    normal_x, normal_y, normal_z, radius, levenberg, first, box, shared, sums, num_envs, num_bodies, num_contacts, num_taxels,
+    normal_x, normal_y, normal_z, net_x, net_y, net_z, radius, levenberg, first, box, shared, sums,
+    num_envs, num_bodies, num_contacts, num_taxels,
     STEPS: tl.constexpr, FEW: tl.constexpr, ENVS: tl.constexpr, GROUP: tl.constexpr, TILE: tl.constexpr,
 ):  # fmt: skip
     """Find β of one body in a block of environments, and share out its contacts."""
@@ -166,9 +169,9 @@ def footprint_kernel(
                 _accumulate(out + 2 * num_taxels, _weighted(p0, p1, p2, p3, fz), is_taxel, start)
             tl.debug_barrier()
     out = sums + 6 * env * num_bodies + body
-    tl.store(out, carried[0], is_env)
-    tl.store(out + num_bodies, carried[1], is_env)
-    tl.store(out + 2 * num_bodies, carried[2], is_env)
+    tl.store(out, _load(net_x + row, is_env) - carried[0], is_env)
+    tl.store(out + num_bodies, _load(net_y + row, is_env) - carried[1], is_env)
+    tl.store(out + 2 * num_bodies, _load(net_z + row, is_env) - carried[2], is_env)
     tl.store(out + 3 * num_bodies, -unmet[0], is_env)
     tl.store(out + 4 * num_bodies, -unmet[1], is_env)
     tl.store(out + 5 * num_bodies, -unmet[2], is_env)

@@ -33,7 +33,6 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-import torch
 from pydantic import Field, StrictInt
 from torch import Tensor
 
@@ -177,11 +176,11 @@ def forward(
         contacts.force,
         contacts.torque,
         contacts.normal,
+        contacts.net,
         constants.footprint,
         constants.levenberg,
     )
-    missed = torch.stack(contacts.net, dim=1) - shared.carried
-    readings = {"missed/signal": missed, "residual/signal": shared.residual}
+    readings = {"missed/signal": shared.missed, "residual/signal": shared.residual}
     if constants.inward is None:
         return {"signal": shared.force, **readings}, {}
     force = planes.vec(shared.force.unbind(1))
