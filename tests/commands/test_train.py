@@ -373,6 +373,7 @@ def test_a_viewed_learner_goes_on_when_the_page_is_opened_closed_and_lost(tmp_pa
                 begin, before = time.monotonic(), page.num_frames
                 while page.num_frames == before and time.monotonic() - begin < 60:
                     viewed.iterate()
+                    time.sleep(0.2)  # the page's process, which has the lowest priority, starts meanwhile
                 assert page.num_frames > before
         page._process.kill()
         viewed.iterate()

@@ -21,7 +21,7 @@ class TestTemperatureGrid(KindConformance):
     parameters = {"cells": [3, 2, 2], "material": "copper", "emissivity": 0.5, "convection": 20.0}
     objects = HEAT
     test_taxel_permutation_commutes = None  # it reads no taxels
-    test_compiled_equals_eager = None  # its graph is part of those below that are compiled
+    test_compiled_equals_eager = None  # its graph is part of `TestPerEnvironment`'s, or of that of all kinds
 
     def document(self, scene, **changes):
         return {**super().document(scene, **changes), "objects": self.objects}
@@ -56,7 +56,6 @@ class TestTemperatureGrid(KindConformance):
 
 
 class TestObjectsWithCells(TestTemperatureGrid):
-    test_compiled_equals_eager = KindConformance.test_compiled_equals_eager
     objects = HEAT | {"item": {**HEAT["item"], "cells": [2, 3, 4]}}
     parameters = {"spacing": 0.009, "material": "skin", "contact_conductance": 500.0, "source": {"power": 2.0}, "lag": 0.3}
 
@@ -103,14 +102,18 @@ class TestPaperByTheManifold(TestTemperatureGrid):
 
 
 class TestPerEnvironment(TestTemperatureGrid):
-    """Temperatures and materials that the state gives."""
+    """Temperatures and materials that the state gives, and an object with cells: one graph of all options."""
 
     test_compiled_equals_eager = KindConformance.test_compiled_equals_eager
     objects = HEAT | {
         "item": {"body": "item", "material": ["aluminium", "wood", "steel"], "temperature": {"per_env": 45.0}},
+        "tool": {**HEAT["tool"], "cells": [2, 3, 4]},
         "floor": {"body": "floor", "material": "wood", "temperature": {"per_env": 10.0}},
     }
-    parameters = {"cells": [2, 2, 2], "material": "copper", "emissivity": "material", "contact_area": "2 cm2"}
+    parameters = {
+        "cells": [2, 2, 2], "material": "copper", "emissivity": "material", "contact_area": "2 cm2", "contact_conductance": 500.0,
+        "source": {"power": 2.0}, "lag": 0.3,
+    }  # fmt: skip
 
     def test_the_state_is_what_counts(self, scene):
         module, _ = self.build(self.document(scene), torch.float64)
