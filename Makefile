@@ -33,10 +33,11 @@ test: $(READY)
 	@$(PYTEST) -m "not slow"
 
 # The rest: each kind compiled by itself, learning, the physics of tasks, the wheel; and calls with their types and shapes checked.
+# Kernels run in processes that check no types.
 test-full: $(READY)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m browser
 	@$(PYTEST) -m "slow and not browser"
-	@$(PYTEST) -m "not slow" --check-types -k "not sensors or float32_equals_reference" tests/geometry tests/observations tests/quantities tests/surfaces tests/tensors tests/sensors
+	@$(PYTEST) -m "not slow" --check-types -k "not kernel and (not sensors or float32_equals_reference)" tests/geometry tests/observations tests/quantities tests/surfaces tests/tensors tests/sensors
 
 # Adapters against the simulators as they are installed, each in an environment of its own beside torch and the rest of $(VENV). mjlab
 # pins MuJoCo 3.11, with which readers and errors are tested too; lerobot reads datasets back; one that cannot be installed is named.
