@@ -45,6 +45,15 @@ def noisy(tmp_path):
     return tgdsl.compile(document(tmp_path, SENSORS, **OBSERVED)).seed(11)
 
 
+@pytest.fixture(scope="module")
+def brief(tmp_path_factory):
+    """A module with random numbers, rings and clocks in few operations, the file it was exported to, and its signature."""
+    folder = tmp_path_factory.mktemp("brief")
+    noise = {"read_delay": 0.013, "gain": [0.8, 1.2]}
+    touch = tgdsl.compile(document(folder, {"a": {"noise": noise}})).seed(11)
+    return touch, folder / "hand.pt2", touch.export(folder / "hand.pt2", dt=0.01)
+
+
 def of_kinds(folder: Path, *names: str) -> tgdsl.TactileModule:
     """Return a module of some sensors of `every_kind`, without noise."""
     sensors = {name: {key: value for key, value in EVERY_KIND[name].items() if key != "noise"} for name in names}
@@ -61,13 +70,17 @@ def test_a_file_computes_what_the_module_computes(noisy, tmp_path):
     assert list(verdict.differences) == [1, 7, 64]
     assert verdict.differences[7].keys() == {"reading/a", "reading/b", "reading/c", "observation/policy"}
     assert verdict.worst <= 1e-6 and verdict.is_equal
-    other = verify(tmp_path / "hand.pt2", tgdsl.compile(document(tmp_path, SENSORS, **OBSERVED)).seed(12), num_calls=3)
-    assert other.worst > 0.01 and not other.is_equal, "other random numbers are noticed"
 
 
-def test_inputs_that_do_not_fit_are_refused(noisy, tmp_path):
-    signature = noisy.export(tmp_path / "hand.pt2", dt=0.01)
-    program = torch.export.load(tmp_path / "hand.pt2").module()
+def test_other_random_numbers_are_noticed(brief):
+    touch, file, _ = brief
+    other = verify(file, tgdsl.TactileModule(touch.plan).seed(12), num_calls=3)
+    assert other.worst > 0.01 and not other.is_equal
+
+
+def test_inputs_that_do_not_fit_are_refused(brief):
+    _, file, signature = brief
+    program = torch.export.load(file).module()
     given = [torch.zeros(5, *port.shape, dtype=getattr(torch, port.dtype)) for port in signature.inputs]
     assert len(program(*given)) == len(signature.outputs)
     for i, tensor in enumerate(given):
@@ -99,7 +112,8 @@ def test_what_cannot_be_exported_is_refused_by_name(noisy, tmp_path):
     assert not (tmp_path / "hand.pt2").exists()
 
 
-def test_files_of_others_and_of_other_taxels_are_refused(noisy, tmp_path):
+def test_files_of_others_and_of_other_taxels_are_refused(brief, tmp_path):
+    _, file, _ = brief
     (tmp_path / "text.pt2").write_text("no archive")
     with zipfile.ZipFile(tmp_path / "empty.pt2", "w"):
         pass
@@ -108,8 +122,7 @@ def test_files_of_others_and_of_other_taxels_are_refused(noisy, tmp_path):
             read_signature(tmp_path / name)
     with pytest.raises(ArtifactError, match="cannot be read: No such file"):
         read_signature(tmp_path / "none.pt2")
-    noisy.export(tmp_path / "hand.pt2", dt=0.01)
-    whole = (tmp_path / "hand.pt2").read_bytes()
+    whole = file.read_bytes()
     (tmp_path / "text.pt2").write_bytes(whole[:-100])
     with pytest.raises(ArtifactError, match="expected a whole file that `tgdsl export` wrote"):
         read_signature(tmp_path / "text.pt2")
@@ -118,10 +131,10 @@ def test_files_of_others_and_of_other_taxels_are_refused(noisy, tmp_path):
     with pytest.raises(ArtifactError, match=r"expected a whole file .* is damaged"):
         read_signature(tmp_path / "text.pt2")
     with pytest.raises(ArtifactError, match="its taxels are other ones than the module's"):
-        verify(tmp_path / "hand.pt2", tgdsl.compile(document(tmp_path, {"a": {"links": "tip"}})))
+        verify(file, tgdsl.compile(document(tmp_path, {"a": {"links": "tip"}})))
 
 
-def test_the_commands_export_and_verify(tmp_path, capsys, monkeypatch):
+def test_the_commands_export_and_verify(brief, tmp_path, capsys, monkeypatch):
     (tmp_path / "hand.yaml").write_text(json.dumps(document(tmp_path, {"a": {}}), default=float))
     monkeypatch.chdir(tmp_path)
     Export(tmp_path / "hand.yaml").run()
@@ -131,9 +144,8 @@ def test_the_commands_export_and_verify(tmp_path, capsys, monkeypatch):
     Verify(Path("hand.pt2"), calls=2).run()
     printed = capsys.readouterr().out
     assert "64 environments, 2 calls" in printed and "inputs of a wrong dtype are refused" in printed
-    tgdsl.compile(tmp_path / "hand.yaml").export("hand.pt2")
     with pytest.raises(ArtifactError, match="does not say what it was exported from; name it with --of"):
-        Verify(Path("hand.pt2")).run()
+        Verify(brief[1]).run()
 
 
 @pytest.mark.slow
