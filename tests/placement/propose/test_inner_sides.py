@@ -446,7 +446,7 @@ def test_rounding_of_limits_decides_nothing(tmp_path, limits):
     """Limits as people draw them: three times as far one way, one and a half times, and thirty degrees, and what float32 makes of them."""
     low, high = map(float, limits.split())
     found = set()
-    for i, (one, two) in enumerate([(0, 0), (1e-7, 0), (0, 1e-7), (-1e-7, 0), (0, -1e-7), (1e-7, -1e-7), (-1e-7, 1e-7)]):
+    for i, (one, two) in enumerate([(0, 0), (1e-7, -1e-7), (-1e-7, 1e-7)]):
         text = hand_with_thumb(THUMB.format("0 1 0", "-90 0"), f"{low * (1 + one)!r} {high * (1 + two)!r}")
         links = propose(loaded(tmp_path, text, f"hand{i}.xml"), DENSITY).links
         found.add(tuple((link.name, link.facing, link.doubt) for link in links))

@@ -152,7 +152,7 @@ class KinematicTree:
     def bodies(self) -> dict[int, list[int]]:
         """The bodies with surface of each segment."""
         result: dict[int, list[int]] = {segment: [] for segment in self.parent}
-        for body in sorted(self.area):
+        for body in sorted(self.surface):
             result[self.segment[body]].append(body)
         return result
 

@@ -271,7 +271,7 @@ def _outside(tree: KinematicTree, flexions: Sequence[Flexion]) -> dict[int, str]
     carrying = {b for flexion in flexions for m in flexion.hand.mounts for b in tree.within(flexion.hand.base, m)}
     scenery = set(free_standing(tree))
     result: dict[int, str] = {}
-    for body in sorted(tree.area.keys() - within):
+    for body in sorted(tree.surface.keys() - within):
         is_before = tree.segment[body] in before or body in carrying
         result[body] = SCENERY if body in scenery else BEFORE if is_before else BESIDE
     return result
@@ -305,7 +305,7 @@ def _sampled_hands(
         include_names = _included(include, tuple(sampler.meshes), dict(sampler.left_out))
         tree = kinematic_tree(sampler.robot, sampler.meshes)
         flexions = chosen_hands(tree)
-        names = {body: sampler.robot.compiled.body(body).name for body in tree.area}
+        names = {body: sampler.robot.compiled.body(body).name for body in tree.surface}
         reasons = {names[body]: why for body, why in _outside(tree, flexions).items()}
         dropped = {names[body]: HIDDEN for flexion in flexions for body in hidden(flexion) if names[body] not in include_names}
         links = [name for name in sampler.meshes if name not in reasons or name in include_names]
