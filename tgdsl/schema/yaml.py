@@ -5,7 +5,9 @@ from __future__ import annotations
 import pathlib
 import warnings
 from collections.abc import Collection, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import lru_cache
 from io import StringIO
 from typing import Any, NamedTuple
 
@@ -104,7 +106,16 @@ def path_text(path: Path) -> str:
 
 
 def parse(text: str, file: str) -> Source:
-    """Read one YAML document; mistakes are noted in the result, not raised."""
+    """Read one YAML document; mistakes are noted in the result, not raised.
+
+    A text that was read before is not read again: a layout of hundreds of lines takes a second, and belongs to many documents.
+    """
+    source = _parsed(text, file)
+    return Source(file, deepcopy(source.value), dict(source.keys), dict(source.values), list(source.problems))
+
+
+@lru_cache(maxsize=64)
+def _parsed(text: str, file: str) -> Source:
     source = Source(file)
     yaml = YAML(typ="safe", pure=True)
     try:
