@@ -19,15 +19,18 @@ from scipy.stats import qmc
 
 from tgdsl.calibration import checks
 from tgdsl.calibration.checks import CORRELATED, UNKNOWN, WORSE, HoldOut, Intervals, TargetErrors, Uncertainty
+from tgdsl.calibration.hand.recording import recording_of
 from tgdsl.calibration.model import Model, Parameter
 from tgdsl.calibration.problem import Problem, ReadingMap, Solution
-from tgdsl.calibration.recordings import Arrays, load_recording
+from tgdsl.calibration.recordings import Arrays, Recording, load_recording
 from tgdsl.compiler.pipeline import Document
 from tgdsl.console.progress import Progress, silent
 from tgdsl.console.tables import text_table
 from tgdsl.errors import TgdslError
 from tgdsl.fields.models import SpecModel
 from tgdsl.files.write import atomic_write
+from tgdsl.module.module import TactileModule
+from tgdsl.runtime.xhand1.log.log import is_hand_log, open_log
 from tgdsl.schema.load import read_spec
 from tgdsl.schema.yaml import with_values
 from tgdsl.sensors import Kind
@@ -127,6 +130,7 @@ def calibrate(
     Args:
         document: A YAML file, or the same as a mapping. The search starts from its values.
         recordings: `.npz` files, YAML documents of CSV files, or arrays; `tgdsl.calibration.recordings` describes the format.
+            Or logs of an XHand1 that pressed fixtures: see `tgdsl.calibration.hand.recording`.
         fit: Parameters as `sensor.field`, or with a range to search: `skin.thickness=1 mm:9 mm`. Without any, only
             nuisances are fitted: the document predicts the recordings.
         reading: Nuisance parameters of each recording's frame: an `offset` of each channel (the camera moved), a `scale` about
@@ -150,9 +154,8 @@ def calibrate(
     progress("compiling")
     model = Model(document, fit, overrides, kinds)
     sources = [recordings] if isinstance(recordings, (str, Path, Mapping)) else list(recordings)
-    outputs = {output.name: output for output in model.module.outputs}
     names = ["<arrays>"] if len(sources) == 1 else [f"<arrays {i}>" for i in range(1, len(sources) + 1)]
-    loaded = [load_recording(source, model.module.inputs, outputs, name) for source, name in zip(sources, names, strict=True)]
+    loaded = [_loaded(source, name, model.module) for source, name in zip(sources, names, strict=True)]
     problem = Problem(model, loaded, reading, gain)
     if hold_out in ("taxel", "blocks") and all(part.target.value.shape[1] == 1 for part in problem.parts):
         raise TgdslError(f"hold_out: {hold_out}: each target has one row; expected time or recording")
@@ -164,6 +167,14 @@ def calibrate(
     notes = _warnings(problem, solution, known, fitted, errors)
     model.set(problem.values(solution.x))
     return Fit({f.path: f for f in fitted}, _nuisances(problem, solution), errors, notes, problem, solution)
+
+
+def _loaded(source: str | Path | Arrays, name: str, touch: TactileModule) -> Recording:
+    """Read a recording, or a log of an XHand1."""
+    outputs = {output.name: output for output in touch.outputs}
+    if not isinstance(source, Mapping) and is_hand_log(Path(source)):
+        source, name = recording_of(open_log(source), touch), str(source)
+    return load_recording(source, touch.inputs, outputs, name)
 
 
 def _best(problem: Problem, starts: int, seed: int, robust: bool, progress: Progress) -> Solution:

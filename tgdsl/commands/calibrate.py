@@ -34,7 +34,7 @@ class CalibrateSensor:
     document: tyro.conf.Positional[args.File]
     """The document; the search starts from its values."""
     recordings: Annotated[tyro.conf.Positional[tuple[Path, ...]], args.optional("RECORDING")]
-    """The recordings, at least one: .npz files, or YAML documents of CSV files."""
+    """The recordings, at least one: .npz files, YAML documents of CSV files, or logs of an XHand1 that pressed fixtures."""
     fit: Annotated[tuple[str, ...], args.optional("[SENSOR.FIELD[=RANGE] ...]")] = ()
     """Parameters to fit; a range limits the search: skin.thickness="1 mm:9 mm". Default: none, only the error is measured."""
     compare: args.OptionalFile = None
