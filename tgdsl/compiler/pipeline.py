@@ -8,6 +8,7 @@ import json
 import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.metadata import version
 from os import PathLike
 from typing import Any, NamedTuple
@@ -154,6 +155,12 @@ def all_layouts(
     return spec, placed(document, bare, resolutions or tuple(spec.resolutions)).layouts
 
 
+@cache
+def _version() -> str:
+    """Return the version of the installed package, whose metadata take milliseconds to read."""
+    return version("tgdsl")
+
+
 def _origin(loaded: Loaded, scene: Model | None) -> Origin:
     robot, digest = loaded.robot_file, hashlib.sha256()
     for path in () if robot is None else xml_files(robot):
@@ -167,5 +174,5 @@ def _origin(loaded: Loaded, scene: Model | None) -> Origin:
         robot=GIVEN if robot is None else portable(robot),
         robot_sha256=digest.hexdigest(),
         resolution=loaded.resolution or "",
-        versions={"tgdsl": version("tgdsl"), "mujoco": mujoco.__version__},
+        versions={"tgdsl": _version(), "mujoco": mujoco.__version__},
     )

@@ -47,6 +47,7 @@ class Registry(Generic[Thing]):
         Raises:
             TgdslError: If it is none, or another one has its name.
         """
+        self._check(thing, "`register`")
         before, self.registered = self.registered, (*self.registered, thing)
         try:
             self.by_name()
@@ -67,16 +68,20 @@ class Registry(Generic[Thing]):
     def by_name(self, given: Sequence[Thing] = ()) -> dict[str, Thing]:
         """Return what `known` does, by name."""
         result: dict[str, tuple[Any, str]] = {}
+        for thing in given:
+            self._check(thing, f"`{self.plural}`")
         sources = [((thing, "tgdsl") for thing in self._own), installed(self.group, self.what, self._wrong)]
         sources += [((thing, "`register`") for thing in self.registered), ((thing, f"`{self.plural}`") for thing in given)]
         for thing, source in chain.from_iterable(sources):
-            if reason := self._wrong(thing):
-                raise TgdslError(f"{source}: {reason}")
             other, first = result.setdefault(name := self._name_of(thing), (thing, source))
             if other is not thing:
                 problem = f'two {self.plural} are called "{name}": one of {first}, one of {source}'
                 raise TgdslError(f"{problem}; rename or remove one")
         return {name: thing for name, (thing, _) in result.items()}
+
+    def _check(self, thing: Any, source: str) -> None:
+        if reason := self._wrong(thing):
+            raise TgdslError(f"{source}: {reason}")
 
 
 @cache
