@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import textwrap
 import typing
 from collections.abc import Iterator
 from contextlib import redirect_stdout, suppress
@@ -13,16 +14,18 @@ import tyro
 
 from tgdsl.commands.cli import Command, example_of
 
-WIDTH = "90"
+WIDTH = 90
 """Columns of the help: those of a block of code in a page."""
 
 
 def command_pages() -> dict[str, str]:
     """Return one page with the help of all commands."""
-    os.environ["COLUMNS"] = WIDTH
+    os.environ["COLUMNS"] = str(WIDTH)
     text = ["# Command line\n\nWhat `tgdsl COMMAND --help` prints.\n"]
     for words in command_names(Command):
-        text.append(f"\n## `tgdsl {' '.join(words)}`\n\n```text\n{help_of(words).strip()}\n```\n")
+        lines = help_of(words).strip().splitlines()  # tyro breaks none of its first lines
+        lines = [line if line.startswith((" ", "usage:", "example:")) else textwrap.fill(line, WIDTH) for line in lines]
+        text.append(f"\n## `tgdsl {' '.join(words)}`\n\n```text\n{chr(10).join(lines)}\n```\n")
     return {"commands.md": "".join(text)}
 
 
