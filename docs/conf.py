@@ -1,4 +1,4 @@
-"""Sphinx's configuration: `make docs` builds these pages, and those that `_ext/tgdsl_docs` generates, into build/docs."""
+"""Sphinx's configuration: `make docs` builds these pages, and the generated ones of `_ext/tgdsl_docs` into build/docs."""
 
 import sys
 import tomllib

@@ -15,7 +15,7 @@ import tyro
 from tgdsl.commands.cli import Command, example_of
 
 WIDTH = 90
-"""Columns of the help: those of a block of code in a page."""
+"""Columns of the help: as many as a block of code has in a page."""
 
 
 def command_pages() -> dict[str, str]:
