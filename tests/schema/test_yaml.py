@@ -48,6 +48,17 @@ def test_every_key_and_value_has_its_place():
     assert [source.get(path) for path in (("z",), ("a", 9), ("a", "b"), ("a", 0, "b", 0))] == [None] * 4
 
 
+def test_a_text_read_twice_is_two_documents():
+    """To override a value of one leaves the other as it was."""
+    first = yaml.parse("a: {b: [1]}\na: 2\n", "f")
+    first.set("a.b", 5)
+    first.value["a"]["c"] = 6
+    first.problems.clear()
+    second = yaml.parse("a: {b: [1]}\na: 2\n", "f")
+    assert (second.value, second.values["a", "b"]) == ({"a": {"b": [1]}}, ("f", 1, 8))
+    assert len(second.problems) == 1
+
+
 def test_a_problem_stands_at_the_nearest_place_that_exists():
     source = yaml.parse("a:\n  b: 1\n", "f")
     assert str(source.problem(("a", "b"), "bad")) == "f:2:6: a.b: bad"

@@ -20,8 +20,7 @@ from tgdsl.formats.model import Model
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.placement.reach import Colliders
-from tgdsl.placement.sample.poisson import Pool
-from tgdsl.placement.sample.sample import Samples, sample
+from tgdsl.placement.sample.sample import Drawn, Samples, sample
 from tgdsl.plan.inputs import ContactPart
 from tgdsl.schema.load import Loaded, LoadedLayout
 from tgdsl.schema.objects import NUM_SIZES, ObjectSpec, TemperaturePerEnv
@@ -34,7 +33,7 @@ from tgdsl.surfaces.geom import Geom, SurfaceGeom
 from tgdsl.surfaces.sensed import DistanceOptions, ObjectHeat, SensedObject
 from tgdsl.surfaces.surface import Surface
 
-Pools = dict[Hashable, dict[Hashable, Pool | None]]  # points that were drawn on links, by the geoms that are sampled and by how
+DrawnOn = dict[Hashable, Drawn]  # what placements on one surface share, by the geoms that are sampled
 
 
 @dataclass(frozen=True)
@@ -146,12 +145,12 @@ def sampled(
     colliders: Colliders,
     patches: list[Patch],
     objects: Sequence[int],
-    pools: Pools,
+    drawn: DrawnOn,
     progress: Progress,
 ) -> Layout:
     """Return the taxels of links.
 
-    `objects` are bodies of the robot's file that are no links; points that are drawn on links are added to `pools`.
+    `objects` are bodies of the robot's file that are no links; what placements on one surface share is added to `drawn`.
     """
     parts: list[Samples] = []
     for i, patch in enumerate(patches):
@@ -159,8 +158,8 @@ def sampled(
         try:
             covered = colliders.cover_of(patch.link.body, patch.geoms, objects)
             surface, name = _surface(colliders.robot, patch), patch.link.name
-            drawn = pools.setdefault((patch.as_collided, *(geom.id for geom in patch.geoms)), {})
-            parts.append(sample(surface, patch.placement, layout.folder, name, covered, drawn))
+            shared = drawn.setdefault((patch.as_collided, *(geom.id for geom in patch.geoms)), {})
+            parts.append(sample(surface, patch.placement, layout.folder, name, covered, shared))
         except SampleError as error:
             layout.note(patch.path, f'link "{patch.link.name}": {error.what}', error.hint)
     loaded.raise_problems()

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from tgdsl.compiler.patches import (
+    DrawnOn,
     LinkBodies,
     Patch,
-    Pools,
     check_named_bodies,
     check_regions,
     link_bodies,
@@ -124,7 +124,7 @@ class Models:
 
     robot: Model | None  # the robot; None if a mistake of the document says why there is none
     scene: Model | None  # the model that holds robot and objects, or None
-    pools: Pools = field(default_factory=dict)  # points that were drawn on links, to choose taxels from
+    drawn: DrawnOn = field(default_factory=dict)  # what the placements of several resolutions share
 
     @cached_property
     def colliders(self) -> Colliders:
@@ -243,7 +243,7 @@ def resolve(loaded: Loaded, progress: Progress = silent, models: Models | None =
     layout = Layout.of_links((), {})
     if loaded.layout is not None:
         placed = [patch for patch in patches if patch.link.name in needed]
-        layout = sampled(loaded, loaded.layout, colliders, placed, felt, models.pools, progress)
+        layout = sampled(loaded, loaded.layout, colliders, placed, felt, models.drawn, progress)
     loaded.raise_problems()
     unused = [(f"link {p.link.name}", "no sensor is on its taxels") for p in patches if p.link.name not in needed]
     unused += [(f"object {name}", "no sensor feels it") for name in loaded.spec.objects if name not in objects]
@@ -263,7 +263,7 @@ def taxels_of_all_links(loaded: Loaded, models: Models) -> Layout:
     assert robot is not None and layout is not None
     patches = patches_of(loaded, layout, robot, layout.spec.resolutions[loaded.resolution or ""])
     loaded.raise_problems()
-    return sampled(loaded, layout, models.colliders, patches, _object_bodies(loaded, robot), models.pools, silent)
+    return sampled(loaded, layout, models.colliders, patches, _object_bodies(loaded, robot), models.drawn, silent)
 
 
 def _object_bodies(loaded: Loaded, robot: Model) -> tuple[int, ...]:

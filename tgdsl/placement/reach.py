@@ -24,6 +24,7 @@ from tgdsl.surfaces.region import Covered
 
 INSIDE = 1e-6  # depth from which a point counts as inside a solid [m]: links that touch face to face overlap by rounding
 DIRECTIONS = 100  # directions in which it is looked whether a ball reaches out of several solids together
+FEW_DIRECTIONS = (4, 20)  # most balls reach out in one of the first few: the rest is looked at for what is left
 NEVER_MET = "on a body that is never in contact with what their sensor feels, by contact alone"
 _UNBOUNDED = ("plane", "hfield", "sdf", "unknown")
 """Types of geoms that are no convex solid: the ground, and shapes that MuJoCo collides otherwise."""
@@ -78,6 +79,14 @@ class Colliders:
         results = [self.solids[i].depth(pos) for i in solids]
         return np.stack(results) if results else np.zeros((0, len(pos)))
 
+    def are_inside(self, solids: Int[np.ndarray, " solid"], pos: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Return which points of the world are inside any of some solids."""
+        result = np.zeros(len(pos), dtype=bool)
+        for i in solids:
+            rest = np.flatnonzero(~result)
+            result[rest] = self.solids[i].depth(pos[rest]) > INSIDE
+        return result
+
     def is_buried(
         self, body: int, pos: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, " n"]
     ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
@@ -87,12 +96,12 @@ class Colliders:
         depth = depths.max(axis=0, initial=-np.inf)
         is_buried = depth > radius + INSIDE
         several = (depth > INSIDE) & ~is_buried & ((depths > -radius).sum(axis=0) > 1)
-        for direction in sphere_directions(DIRECTIONS):
+        for directions in np.split(sphere_directions(DIRECTIONS), FEW_DIRECTIONS):
             doubtful = np.flatnonzero(several)
             if not len(doubtful):
                 break
-            rim = at[doubtful] + radius[doubtful, None] * direction
-            several[doubtful] = self.depths(solids, rim).max(axis=0) > INSIDE
+            rim = (at[doubtful, None] + radius[doubtful, None, None] * directions).reshape(-1, 3)
+            several[doubtful] = self.are_inside(solids, rim).reshape(len(doubtful), -1).all(axis=1)
         return is_buried | several, depth
 
     def cover_of(self, body: str, geoms: Sequence[Geom], ignored: Collection[int] = ()) -> Covered:
@@ -102,7 +111,7 @@ class Colliders:
         solids = solids[~np.isin(self.geom[solids], [geom.id for geom in geoms])]
 
         def is_covered(pos: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-            return self.depths(solids, self.in_world(body_id, pos)).max(axis=0, initial=-np.inf) > INSIDE
+            return self.are_inside(solids, self.in_world(body_id, pos))
 
         return is_covered
 

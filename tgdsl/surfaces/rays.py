@@ -122,14 +122,13 @@ def _hits(
     view: OrthographicView, uv: Float[np.ndarray, "ray 2"], face: Int[np.ndarray, " pair"], ray: Int[np.ndarray, " pair"]
 ) -> tuple[Int[np.ndarray, " hit"], Int[np.ndarray, " hit"], Float[np.ndarray, " hit"]]:
     """Return face, ray and depth of the pairs that meet."""
-    u, v = uv[ray].T
-    is_hit = np.ones(len(ray), dtype=bool)
     for i in range(3):
         start, end = view.corners[:, i, :2], view.corners[:, (i + 1) % 3, :2]
         along = end - start
         inward = np.stack([-along[:, 1], along[:, 0]], axis=-1) / np.linalg.norm(along, axis=1, keepdims=True)
-        is_hit &= inward[face, 0] * (u - start[face, 0]) + inward[face, 1] * (v - start[face, 1]) >= -view.rounding
-    face, ray = face[is_hit], ray[is_hit]
+        offset = uv[ray] - start[face]
+        is_inside = inward[face, 0] * offset[:, 0] + inward[face, 1] * offset[:, 1] >= -view.rounding
+        face, ray = face[is_inside], ray[is_inside]
     corners = view.corners[face]
     slope = view.normals[face] @ view.axes.T
     offset = uv[ray] - corners[:, 0, :2]

@@ -79,7 +79,8 @@ def rasterise(corners: Float[Array, "face 3 3"], width: int, height: int) -> Fra
 
 def _draw(fragments: Fragments, corners: Array, face: Array, row: Array, column: Array, width: int) -> None:
     """Draw triangles at some pixels where they are nearer than what is there."""
-    drawn, index = np.unique(face, return_inverse=True)
+    is_next = np.diff(face, prepend=face[:1]) > 0  # faces ascend
+    drawn, index = np.concatenate([face[:1], face[is_next]]), np.cumsum(is_next)
     start = corners[drawn, 0, :2]
     (x, y), (x_end, y_end) = (corners[drawn, 1, :2] - start).T, (corners[drawn, 2, :2] - start).T
     area = x * y_end - x_end * y
@@ -124,9 +125,11 @@ def shade(image: Array, fragments: Fragments, mesh: Mesh, colour: Array, viewpor
     normal *= np.where(normal @ camera.toward < 0, -1, 1)[:, None]
     lit = 0.55 + 0.5 * np.clip(normal @ light_direction(camera), 0, 1)
     image[drawn] += opacity * (np.minimum(colour[face] * lit[:, None], 1) - image[drawn])
-    near = np.where(drawn, fragments.nearness, -1.0)
-    jump = np.maximum(*(np.abs(np.diff(near, axis=axis, append=near.take([-1], axis))) for axis in (0, 1)))
-    image[jump > np.maximum(6 / viewport.scale, 0.002)] *= 0.62
+    near, edge = np.where(drawn, fragments.nearness, -1.0), max(6 / viewport.scale, 0.002)
+    is_edge = np.zeros(near.shape, dtype=bool)
+    is_edge[:-1] = np.abs(np.diff(near, axis=0)) > edge
+    is_edge[:, :-1] |= np.abs(np.diff(near, axis=1)) > edge
+    image[is_edge] *= 0.62
     return image
 
 

@@ -6,6 +6,7 @@ import trimesh
 from oracles.setups.solids import ball, box, surface_of
 from surfaces import DOWN, HERE, error_of, placement, plate
 
+from tgdsl.placement.sample import sample as sampling
 from tgdsl.placement.sample.sample import sample
 
 TOLERANCE = 1e-12  # metres: parts are centimetres in float64, and a position is a few sums
@@ -31,6 +32,20 @@ def test_columns_and_rows_are_right_handed_and_follow_columns_along():
     np.testing.assert_allclose(found.pos[1] - found.pos[0], [0.01, 0, 0], atol=TOLERANCE)
     np.testing.assert_allclose(found.pos[2] - found.pos[0], [0, -0.02, 0], atol=TOLERANCE)  # (−z) × x = −y
     np.testing.assert_allclose(found.tangent, np.tile([1.0, 0, 0], (4, 1)), atol=TOLERANCE)
+
+
+def test_grids_of_several_resolutions_look_for_their_rectangle_once(monkeypatch):
+    """And have the bits that each has alone; another region has a rectangle of its own."""
+    pad, drawn, looked = surface_of(ball(0.01)), {}, []
+    region = [{"box": {"min": [-0.004, -0.003, 0], "max": [0.004, 0.003, 1]}}]
+    places = [placement("grid", rows=n, columns=2, direction=DOWN, region=region) for n in (2, 3)]
+    places.append(placement("grid", rows=2, columns=2, direction=DOWN, region=[{"facing": [0, 0, 1], "within": 0.3}]))
+    alone = [sample(pad, where, HERE) for where in places]
+    seen = sampling.visible_rectangle
+    monkeypatch.setattr(sampling, "visible_rectangle", lambda *given: looked.append(given) or seen(*given))
+    for where, expected in zip(places, alone, strict=True):
+        assert sample(pad, where, HERE, drawn=drawn).pos.tobytes() == expected.pos.tobytes()
+    assert len(looked) == 2
 
 
 def test_reversed_rows_on_a_mirrored_pad_give_the_mirror_images_in_order():

@@ -6,7 +6,7 @@ Every guess is written down in the file, for its reader to keep or to change. A 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Hashable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,8 +27,7 @@ from tgdsl.placement.propose.hands import (
     with_assumed_limits,
 )
 from tgdsl.placement.propose.surfaces import HIDDEN, LinkSurface, Options, Sampler, link_meshes
-from tgdsl.placement.sample.poisson import Pool
-from tgdsl.placement.sample.sample import Samples, sample
+from tgdsl.placement.sample.sample import Drawn, Samples, sample
 from tgdsl.schema.placement import MAX_COUNT, Poisson
 from tgdsl.schema.select import matching
 from tgdsl.surfaces.surface import Surface
@@ -147,7 +146,7 @@ class Draft:
                 include matches no link that can have taxels.
         """
         self.robot, self._sampler = robot, Sampler(robot)
-        self._pools: dict[str, tuple[Any, dict[Hashable, Pool | None]]] = {}  # by link: the surface, and the pools on it
+        self._pools: dict[str, tuple[Any, Drawn]] = {}  # by link: the surface, and the pools on it
         flexions, surfaces = _sampled_hands(self._sampler, include, progress, density)
         left_out = tuple(self._sampler.left_out)
         if not surfaces:

@@ -9,6 +9,7 @@ import csv
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -25,6 +26,9 @@ MIN_COSINE = 0.1  # a grid cell on a steep face counts at most 1/0.1 times its p
 ROUNDED = 1e-14  # largest rounding of a squared length, and of the cosine of a normal and its tangent
 MAX_DENSITY = poisson.MAX_POOL / poisson.PER_SAMPLE
 """Largest area per squared spacing: about 0.7 times as many samples fit, and the pool resolves no finer spacing."""
+
+Drawn = dict[Hashable, Any]
+"""Pools of points, and rectangles in which grids are seen, on one surface, by what of a placement they depend on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,21 +49,23 @@ def sample(
     folder: Path,
     link: str = "",
     is_covered: Covered | None = None,
-    pools: dict[Hashable, poisson.Pool | None] | None = None,
+    drawn: Drawn | None = None,
 ) -> Samples:
     """Return the taxels that a placement puts on a link's surface; the same input gives the same bytes.
+
+    `drawn` keeps what other placements on the same surface share.
 
     Raises:
         SampleError: If the surface, or the file of points, cannot satisfy the placement.
     """
     if isinstance(placement, Grid):
-        return _grid(surface, placement, is_covered if placement.exposed else None)
+        return _grid(surface, placement, is_covered if placement.exposed else None, {} if drawn is None else drawn)
     if isinstance(placement, Poisson):
-        return _poisson(surface, placement, is_covered if placement.exposed else None, {} if pools is None else pools)
+        return _poisson(surface, placement, is_covered if placement.exposed else None, {} if drawn is None else drawn)
     return _points(point_table(placement, folder, link))
 
 
-def _grid(surface: Surface, placement: Grid, is_covered: Covered | None) -> Samples:
+def _grid(surface: Surface, placement: Grid, is_covered: Covered | None, drawn: Drawn) -> Samples:
     """Project rows × columns onto the surface.
 
     Columns, rows and direction are a right-handed frame: seen from where the rays start, columns run to the right and rows
@@ -67,7 +73,10 @@ def _grid(surface: Surface, placement: Grid, is_covered: Covered | None) -> Samp
     """
     view = OrthographicView.of(surface, _grid_axes(placement))
     region = Region.of(surface, placement.region, is_covered)
-    rectangle = visible_rectangle(view, region)
+    seen = (placement.region, placement.exposed, placement.direction, placement.columns_along)
+    if seen not in drawn:
+        drawn[seen] = visible_rectangle(view, region)
+    rectangle = drawn[seen]
     if rectangle is None:
         problem = "the region" if placement.region else "the link's exposed surface" if is_covered else "the link's surface"
         raise SampleError(f"no part of {problem} is seen along {_shown(placement.direction)}", "turn `direction`")
@@ -130,20 +139,18 @@ def _central(placement: Grid, cell: Int[np.ndarray, "hit 2"], pitch: Float[np.nd
     return np.sort(np.lexsort((cell[:, 1], cell[:, 0], tier))[: placement.count])
 
 
-def _poisson(
-    surface: Surface, placement: Poisson, is_covered: Covered | None, pools: dict[Hashable, poisson.Pool | None]
-) -> Samples:
+def _poisson(surface: Surface, placement: Poisson, is_covered: Covered | None, drawn: Drawn) -> Samples:
     """Poisson-disk samples: an exact count, or as many as fit at a spacing."""
     size = placement.spacing if placement.count is None else poisson.size(placement.count)
-    drawn = (placement.region, placement.exposed, placement.seed, size, placement.sampler)
-    if drawn not in pools:
+    pooled = (placement.region, placement.exposed, placement.seed, size, placement.sampler)
+    if pooled not in drawn:
         try:
             shell = meshlab.outer_shell(surface)
         except ImportError as error:
             raise SampleError(f"`poisson` needs pymeshlab: {error}", "pip install pymeshlab") from error
         region = Region.of(surface, placement.region, is_covered)
-        pools[drawn] = poisson.pool(shell, region, placement.seed, placement.count, placement.spacing, placement.sampler)
-    pool = pools[drawn]
+        drawn[pooled] = poisson.pool(shell, region, placement.seed, placement.count, placement.spacing, placement.sampler)
+    pool = drawn[pooled]
     part, hint = "exposed outer surface" if placement.exposed else "outer surface", "widen `region`"
     hint = "other links cover it: place none here" if placement.exposed and not placement.region else hint
     if pool is None:
