@@ -2,13 +2,16 @@
 
 import dataclasses
 import math
+import re
 
 import numpy as np
 import pytest
 import torch
-from tiny_tasks import NOISY, RADIUS, RANDOM, actions, same, taxel_world, tiny_env, tiny_envs
+from tiny_tasks import NOISY, RADIUS, RANDOM, actions, same, taxel_world, tiny_env, tiny_envs, write_task
 
 from tgdsl.errors import SimulationError, SpecError
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.sensed import Felt
 from tgdsl.runtime import connect
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.connect import SOURCES
@@ -354,6 +357,32 @@ def test_only_what_is_chosen_is_computed(make, touch, kind, size):
 def test_a_placement_is_a_group_of_links(make):
     env = make(2, more="touch: depth\nplacement: tips\n")
     assert env.groups["tactile_sensors"] == 2 and set(env.touch.taxels["depth"]["link"]) == {"right"}
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ("touch: depth\nplacement: tipps\n", r'task\.yaml:\d+:12: placement: no link matches "tipps"; did you mean "tips"\?'),
+        ("touch: depth\nnoise: nosy\n", r'task\.yaml:\d+:8: noise: unknown noise profile "nosy"; did you mean "noisy"\?'),
+        ("touch: depth\nresolution: hi\n", r'task\.yaml:\d+:13: resolution: unknown resolution "hi"'),
+        ("touch: depth\nsensors: {depth: {feels: [cub]}}\n", r"task\.yaml:\d+:\d+: sensors\.depth\.feels"),
+    ],
+)
+def test_what_a_task_sets_wrongly_in_its_sensors_is_named_at_its_own_key(make, more, said):
+    with pytest.raises(SpecError) as error:
+        make(2, more=more)
+    assert [re.search(said, str(problem)) is not None for problem in error.value.problems] == [True], str(error.value)
+
+
+def test_a_placement_that_is_overridden_is_named_as_such(tmp_path):
+    task = write_task(tmp_path, more="touch: depth\n")
+    for options, said in (
+        ({"overrides": {"placement": "tipps"}}, '--set placement=tipps: placement: no link matches "tipps"'),
+        ({"feels": [Felt("depth", "tipps", "clean")]}, 'placement: no link matches "tipps"'),
+    ):
+        with pytest.raises(SpecError) as error:
+            TouchEnv(task, 2, threads=1, **options)
+        assert str(error.value).startswith(said)
 
 
 def test_an_action_of_another_shape_is_refused(make):

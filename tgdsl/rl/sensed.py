@@ -5,8 +5,9 @@ Shapes: `env` environments, `step` physics steps of a control step, the first on
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
@@ -15,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.console.progress import Progress
-from tgdsl.errors import SpecError, did_you_mean, listed
+from tgdsl.errors import Problem, SpecError, did_you_mean, listed
 from tgdsl.layout.layout import Layout
 from tgdsl.module.module import TactileModule
 from tgdsl.observations.observations import OfReading, PerLink
@@ -24,11 +25,21 @@ from tgdsl.rl.spec import touch_types
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.schema.load import Loaded, load
 from tgdsl.schema.select import matching
+from tgdsl.schema.yaml import SET
+from tgdsl.schema.yaml import Path as Place
 from tgdsl.sensors.known import known_kinds
 from tgdsl.tuning.compile import compile as compile_document
 
 GROUP = "tactile_sensors"  # the observation group of what a policy feels
 CLEAN = "clean"  # the noise profile that has none
+KEYS: dict[str, Place] = {
+    "links": ("placement",),
+    "noise": ("noise",),
+    "resolution": ("resolution",),
+    "robot": ("physics", "collision"),
+    "objects": ("variants",),
+}
+"""A task's keys that set something in the sensors' document, by what they set there."""
 
 
 class Felt(NamedTuple):
@@ -147,13 +158,14 @@ def compile_sensed(
         overrides[f"sensors.{contact}.outputs"] = list(dict.fromkeys((*outputs, *forces)))
     observed = {name: [observation.model_dump(exclude_unset=True)] for name, observation in observations.items()}
     overrides = {"observations": observed | dict(also or {})} | overrides
-    touch = compile_document(
-        loaded.folder / spec.document,
-        sensors=set(sensor.values()) or None,
-        overrides=overrides,
-        device=device,
-        progress=progress,
-    )
+    with _mistakes_at_keys(loaded, of_several=feels is not None):
+        touch = compile_document(
+            loaded.folder / spec.document,
+            sensors=set(sensor.values()) or None,
+            overrides=overrides,
+            device=device,
+            progress=progress,
+        )
     layouts = {planned.name: touch.plan.layout_of(planned) for planned in touch.plan.sensors}
     groups = {
         each.group: _source(loaded, touch, each, observations[each.observation], layouts[name]) for each, name in felts.items()
@@ -257,12 +269,39 @@ def sensors_document(loaded: LoadedTask) -> Loaded:
         problem = f'"{spec.document}" has no sensor "{name}"'
         raise loaded.error(("sensors", name), problem, did_you_mean(name, document.spec.sensors, "sensors"))
     if spec.sensors:
-        document = load(file, _sensor_overrides(loaded), known_kinds())
-        document.raise_problems()
+        with _mistakes_at_keys(loaded):
+            document = load(file, _sensor_overrides(loaded), known_kinds())
+            document.raise_problems()
     if spec.object not in document.spec.objects:
         problem = f'"{spec.document}" has no object "{spec.object}", only {listed(list(document.spec.objects))}'
         raise loaded.error(("object",), problem)
     return document
+
+
+@contextmanager
+def _mistakes_at_keys(loaded: LoadedTask, of_several: bool = False) -> Iterator[None]:
+    """Have mistakes in values that a task sets in the sensors' document stand at the task's keys.
+
+    `of_several`: placements and noise are those that several policies feel, not the task's.
+    """
+    try:
+        yield
+    except SpecError as error:
+        raise SpecError([_at_key(loaded, problem, of_several) for problem in error.problems]) from error
+
+
+def _at_key(loaded: LoadedTask, problem: Problem, of_several: bool) -> Problem:
+    if not problem.file.startswith(SET):
+        return problem
+    first, *names = problem.file.removeprefix(SET).partition("=")[0].split(".")
+    if first == "sensors" and names[-1] in loaded.spec.sensors.get(names[0], {}):
+        return loaded.source.problem((first, *names), problem.what, problem.hint)
+    place = KEYS.get(names[-1] if first == "sensors" else first)
+    if place is None:
+        return problem
+    if of_several and first == "sensors":
+        return replace(problem, file=place[0], path="")
+    return loaded.source.problem(place, problem.what, problem.hint)
 
 
 def _sensor_overrides(loaded: LoadedTask) -> dict[str, Any]:

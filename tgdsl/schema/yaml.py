@@ -20,6 +20,7 @@ from tgdsl.errors import Problem, did_you_mean
 
 Path = tuple[str | int, ...]
 MAX_DEPTH = 50  # values that are nested more deeply are refused, before Python's own limit is reached in some odd place
+SET = "--set "  # names of overrides begin with it, where those of files stand in mistakes
 _TOO_DEEP = f"nested more than {MAX_DEPTH} deep"
 
 
@@ -76,7 +77,7 @@ class Source:
     def set(self, dotted: str, value: Any) -> None:
         """Override one value, as the command line's `--set key.key=value` does; a text is YAML, all else a plain value."""
         path: Path = tuple(str(dotted).split("."))
-        name = f"--set {dotted}={value}"
+        name = f"{SET}{dotted}={value}"
         parsed = parse(value, name) if isinstance(value, str) else from_mapping({path[-1]: value}, name)
         self.problems += parsed.problems
         if parsed.problems:
