@@ -5,6 +5,7 @@ import torch
 
 from tgdsl.geometry.planes import split
 from tgdsl.quantities.moment_sums import MomentField, PointCloud, cloud_moments, field_moments, plane_moments
+from tgdsl.quantities.moments import percent
 
 
 def planes_of(points):
@@ -138,3 +139,7 @@ def test_splines_are_those_of_scipy_and_have_no_jumps():
     slope = torch.autograd.grad(field_moments(split(leaf), field).mass.sum(), leaf)[0].numpy()
     assert np.abs(np.diff(slope, axis=0)).max() < 0.01 * np.abs(slope).max()
     assert field_moments(planes_of([[0, np.nan, 0]]), field).mass.isnan().all()
+
+
+def test_percentages_have_two_digits_and_no_exponent():
+    assert [percent(share) for share in (1.23e-7, 0.0384, 1.234, 0.0)] == ["0.000012 %", "3.8 %", "120 %", "0 %"]

@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Shaped
+from jaxtyping import Int, Shaped
 
+from tgdsl.errors import listed
 from tgdsl.geometry.bvh import query_operations
 from tgdsl.layout.layout import unfelt_ids
 from tgdsl.module.memory import Memory
@@ -21,6 +22,7 @@ from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.quantities.base import Quantity
 from tgdsl.sensors.noise.pipeline import stages_of
 from tgdsl.sensors.noise.spec import quantity
+from tgdsl.sensors.noise.stage import Number
 from tgdsl.tensors.buffers import Constants
 from tgdsl.tensors.torch_internals import TorchDispatchMode
 
@@ -30,6 +32,7 @@ _FREE = frozenset([
     "unsqueeze", "squeeze", "detach", "alias", "expand", "clone", "unbind", "to_copy",
 ])  # fmt: skip
 _FFT = 2.5  # operations of a real fast Fourier transform of n numbers: this by n log2 n
+MOST_LINKS = 4  # links that a line of noise names
 _CLOCK_BYTES = 24  # three int64 of the clock for each environment, in addition to the ages of calls
 
 
@@ -180,21 +183,51 @@ def _sizes(touch: Explained, sensor: PlannedSensor) -> tuple[int, int]:
 
 
 def _noise(touch: Explained, sensor: PlannedSensor) -> list[str]:
-    """Return the stages of a sensor's noise, in their order, with the values of their knobs."""
+    """Return the stages of a sensor's noise, in their order, with the values of their knobs, and the rows that have them."""
     if sensor.noise is None:
         return []
     lines, constants = [], sensor.noise.constants
     for stage in stages_of(sensor.noise.terms):
-        stage_lines = {}
-        for name, number in stage.numbers.items():
-            if name in constants and number.label is not None:
-                value = constants[name]
+        shown = {name: number for name, number in stage.numbers.items() if name in constants and number.label is not None}
+        parts = [(name, [name]) for name in shown] if stage.is_split else [(stage.name, list(shown))]
+        for term, names in parts:
+            rows = _affected(constants, {name: shown[name] for name in names})
+            texts = []
+            for name in names:
+                value, number = constants[name], shown[name]
+                value = value if rows is None or value.shape[-1] == 1 else value[..., rows]
                 label = "stuck at " if name == "dead_low" and "dead_high" not in constants else number.label
-                amount = _amplitudes(sensor, value) if number.unit is None else _value(value[..., 0, :]) + number.unit
-                stage_lines[name] = label + amount
-        parts = stage_lines.items() if stage.is_split else [(stage.name, ", ".join(stage_lines.values()))]
-        lines += [f"{term} {part}" for term, part in parts]
+                texts.append(f"{label}{_amplitudes(sensor, value) if number.unit is None else _with_unit(value, number.unit)}")
+            where = "" if rows is None else f"; {_rows(touch.plan, sensor, rows)}"
+            lines.append(f"{term} {', '.join(texts)}{where}")
     return lines
+
+
+def _affected(constants: Mapping[str, np.ndarray], numbers: Mapping[str, Number]) -> Int[np.ndarray, " affected"] | None:
+    """Return the rows in which numbers of a stage have an effect; None if they are all, or if none decides it."""
+    has_effect = np.zeros(1, dtype=bool)
+    for name, number in numbers.items():
+        if number.neutral is not None:
+            value = constants[name]
+            has_effect = has_effect | (value != number.neutral).reshape(-1, value.shape[-1]).any(axis=0)
+    return np.flatnonzero(has_effect) if has_effect.any() and not has_effect.all() else None
+
+
+def _rows(plan: Plan, sensor: PlannedSensor, rows: Int[np.ndarray, " affected"]) -> str:
+    """Return how many rows of a reading these are, and their links where rows are taxels or links."""
+    reading, layout = sensor.readings[0], plan.layout_of(sensor)
+    text = f"{len(rows)} of {reading.num_rows} {reading.rows if reading.rows == 'body' else reading.rows + 's'}"
+    if len(sensor.taxels):
+        links = [layout.links[i].name for i in np.unique(layout.link_id[rows])]
+    elif len(sensor.links) == reading.num_rows:
+        links = [sensor.links[i].name for i in rows]
+    else:
+        return text
+    return f"{text}: {listed(links, MOST_LINKS)}"
+
+
+def _with_unit(value: Shaped[np.ndarray, "*end 1 row"], unit: str) -> str:
+    return _value((100.0 * value if unit == " %" else value)[..., 0, :]) + unit
 
 
 def _amplitudes(sensor: PlannedSensor, value: Shaped[np.ndarray, "*end channel row"]) -> str:

@@ -253,7 +253,7 @@ class _Moments(Quantity):
                 size = field.values[0].nbytes * int(field.num[i].prod())
                 which = f"variant {i // num_radii}, " if len(table.area) > 1 else ""
                 nodes = f"{' × '.join(map(str, field.num[i]))} nodes every {1e3 * accuracy['cell']:.3g} mm, {size} bytes"
-                shown = {key: f"{100 * value:.2g} %" for key, value in accuracy.items()}
+                shown = {key: percent(value) for key, value in accuracy.items()}
                 lines += [
                     f"{objects[table.object].name}, {which}radius {1e3 * accuracy['radius']:.3g} mm: {nodes}",
                     f"  RMS error of S0 {shown['mass_rms']} of full scale (largest {shown['mass_max']}), of S1"
@@ -269,6 +269,11 @@ class _Moments(Quantity):
 
 
 MOMENTS = _Moments()
+
+
+def percent(share: float) -> str:
+    """Return a share as a percentage with two significant digits, and no exponent."""
+    return f"{np.format_float_positional(100 * share, precision=2, fractional=False, trim='-')} %"
 
 
 def _way(use: Use) -> tuple[Any, ...]:

@@ -134,7 +134,7 @@ def test_explain_tells_the_stages_and_their_values(build):
         "noise: bias force 0.02 N, torque -0.0001 N·m",
         "noise: white_noise force 0.005–0.25 N, torque 1e-05–0.25 N·m",
         "noise: drift force [0.0001, 0.0002] N, torque [0, 0] N·m",
-        "noise: dead probability 0.05, stuck from force -1 N, torque -1 N·m, to force 1 N, torque 1 N·m",
+        "noise: dead probability 5 %, stuck from force -1 N, torque -1 N·m, to force 1 N, torque 1 N·m",
     ]
     assert "rate: 60 Hz" in text and "history: stack of 4 calls" in text
     num = 17 * 6 * 4
@@ -143,6 +143,21 @@ def test_explain_tells_the_stages_and_their_values(build):
     per_taxel = f"{fixed / 17:.3g} per taxel, and for each call of the last 0.03 s {num} bytes, 24 per taxel"
     assert f"remembers {what} ({fixed} bytes per environment), {per_taxel}" in text
     assert f"remembers    {fixed + 24:>10} bytes, and {num} for each call of the delays" in text
+
+
+def test_explain_says_which_taxels_have_noise(build):
+    """Of links by name: numbers are those of the taxels that have it, and shares are percentages."""
+    noise = {"links": {"tip": {"gain": [0.9, 1.1], "white_noise": {"force": 0.25}, "dead_probability": 0.0005}}}
+    touch = build(torch.float32, s={"noise": noise})
+    num = int((touch.plan.layout.link_id == [link.name for link in touch.plan.layout.links].index("tip")).sum())
+    where = f"{num} of {touch.plan.layout.num_taxels} taxels: tip"
+    rows = [line.strip() for line in touch.explain().splitlines() if "noise: " in line]
+    assert 0 < num < touch.plan.layout.num_taxels
+    assert rows == [
+        f"noise: gain from 0.9, to 1.1; {where}",
+        f"noise: white_noise force 0.25 N, torque 0 N·m; {where}",
+        f"noise: dead probability 0.05 %, stuck at force 0 N, torque 0 N·m; {where}",
+    ]
 
 
 @pytest.mark.parametrize("history", [{}, {"history": 3}, {"history": {"length": 5, "reduce": "mean"}}, {"history": {"length": 5, "reduce": "last"}}])  # fmt: skip

@@ -58,7 +58,7 @@ class Number:
 
     draw: int | None  # which random number of an episode says where in its range it is, unique to it; None: it is not drawn
     label: str | None = ""  # text before its value in `explain`; None: it is not shown
-    unit: str | None = ""  # its unit; None: the unit of the reading
+    unit: str | None = ""  # its unit in `explain`, where " %" shows shares as percentages; None: the unit of the reading
     knob: str | None = ""  # the path of its range in the knobs, `gain.0`; "": its name; None: it is of no knob
     absent: Range = ZERO  # its range where such a knob is None
     # the value that has no effect: a stage is left out where all rows have it. None: it does not decide.

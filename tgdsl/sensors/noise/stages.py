@@ -319,7 +319,7 @@ class Dead(Stage):
         dead_range: tuple[AnyAmplitude, AnyAmplitude] = (NO_AMPLITUDE, NO_AMPLITUDE)
         """Lowest and highest stuck reading of a dead taxel, drawn at reset [unit of the reading]."""
 
-    dead_probability: Annotated[Tensor, Number(13, "probability ", stream=random.DEAD)]
+    dead_probability: Annotated[Tensor, Number(13, "probability ", " %", stream=random.DEAD)]
     """p."""
     dead_low: Annotated[Tensor, Number(14, "stuck from ", None, "dead_range.0", neutral=None)]
     dead_high: Annotated[Tensor | None, Number(15, "to ", None, "dead_range.1", neutral=None)]
