@@ -145,6 +145,11 @@ def test_parameters_that_cannot_be_fitted(path, fit, message):
         Model(path, [fit])
 
 
+def test_no_recording_is_said_to_be_none(path):
+    with pytest.raises(TgdslError, match="there is no recording, expected at least one"):
+        tgdsl.calibrate(path, [], ["touch.normal_stiffness"])
+
+
 def test_what_the_data_cannot_tell_is_named(path):
     """No damping shows in a ball that rests: its interval is the whole range. A range that ends before the truth is hit."""
     arrays = recording(path, lag=0.0)

@@ -146,6 +146,12 @@ def test_what_mujoco_refuses_is_told_with_file_and_element(tmp_path, text, parts
     assert all(part in message for part in parts)
 
 
+def test_a_file_that_is_no_robot_is_refused_by_what_is_expected(tmp_path):
+    (tmp_path / "hand.yaml").write_text("tgdsl: 1\n")
+    with pytest.raises(RobotError, match=r"hand\.yaml: this is no robot or scene file, expected MJCF, URDF or USD$"):
+        load_model(tmp_path / "hand.yaml")
+
+
 def test_files_that_a_model_is_made_of(tmp_path):
     (tmp_path / "hand").mkdir()
     (tmp_path / "hand" / "hand.xml").write_text(

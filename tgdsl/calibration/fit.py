@@ -154,6 +154,8 @@ def calibrate(
     progress("compiling")
     model = Model(document, fit, overrides, kinds)
     sources = [recordings] if isinstance(recordings, (str, Path, Mapping)) else list(recordings)
+    if not sources:
+        raise TgdslError("there is no recording, expected at least one: an .npz file, or a YAML document of CSV files")
     names = ["<arrays>"] if len(sources) == 1 else [f"<arrays {i}>" for i in range(1, len(sources) + 1)]
     loaded = [_loaded(source, name, model.module) for source, name in zip(sources, names, strict=True)]
     problem = Problem(model, loaded, reading, gain)

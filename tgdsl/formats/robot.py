@@ -39,6 +39,7 @@ def _refuse_part(path: Path) -> Model:
     raise RobotError(f"{path}: a part that models <include>, and no model; name the file that includes it")
 
 
+MJCF = (".xml", ".mjcf")  # endings of files of which MuJoCo says what is wrong, even where they are no XML
 ROOTS: Mapping[str, Reader] = {"robot": read_urdf, "mujocoinclude": _refuse_part}
 """By the root element of XML; any other is MJCF's."""
 WRITERS: Mapping[str, Writer] = dict.fromkeys((".usda", ".usdc", ".usd"), _write_usd)  # by a file's ending
@@ -52,8 +53,10 @@ def load_model(path: Path) -> Model:
     """
     try:
         with told_of(path):
-            reader = READERS.get(path.suffix.lower()) or ROOTS.get(_root_element(path), read_mjcf)
-            return reader(path)
+            suffix, root = path.suffix.lower(), "" if path.suffix.lower() in READERS else _root_element(path)
+            if not root and suffix not in (*READERS, *MJCF) and path.is_file():
+                raise RobotError(f"{path}: this is no robot or scene file, expected MJCF, URDF or USD")
+            return (READERS.get(suffix) or ROOTS.get(root, read_mjcf))(path)
     except (ValueError, OSError, mujoco.FatalError) as error:
         raise RobotError(f"{path}: {' '.join(str(error).split())}") from error
 

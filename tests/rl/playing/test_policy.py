@@ -132,10 +132,12 @@ def test_files_that_cannot_be_read(tmp_path):
         Policy(read_policy(tmp_path / "none.pt"), GROUPS, 3, 2)
     assert str(raised.value) == f"{tmp_path}/none.pt: cannot read this file: No such file or directory"
     torch.save({"actor_state_dict": {}}, tmp_path / "model_0.pt")  # what the runner keeps: no policy by itself
-    (tmp_path / "text.pt").write_text("no module")
+    for name in ("text.pt", "policy.onnx"):
+        (tmp_path / name).write_text("no module")
     what = {
         "model_0.pt": "a checkpoint, from which learning goes on; the policy of a run is its policy.pt",
-        "text.pt": "no TorchScript",
+        "text.pt": r"no TorchScript file, as rsl_rl's `export_policy_to_jit` writes it$",
+        "policy.onnx": "the ONNX form of a policy, expected the policy.pt beside it",
     }
     for name, this in what.items():
         with pytest.raises(PolicyError, match=rf"{name}: this is {this}"):

@@ -179,8 +179,11 @@ def read_policy(file: Path) -> PolicyFile:
         if "data.pkl" in files and "constants.pkl" not in files:  # `torch.save`, where TorchScript has a file of constants
             policy = f"the policy of a run is its {POLICY}, that of rsl_rl's runner what `export_policy_to_jit` writes"
             raise PolicyError(f"{file}: this is a checkpoint, from which learning goes on; {policy}") from error
+        if file.suffix == ".onnx":
+            raise PolicyError(f"{file}: this is the ONNX form of a policy, expected the {POLICY} beside it") from error
         problem = "this is no TorchScript file, as rsl_rl's `export_policy_to_jit` writes it"
-        raise PolicyError(f"{file}: {problem}: {str(error).strip().splitlines()[0]}") from error
+        reason = f": {str(error).strip().splitlines()[0]}" if files else ""
+        raise PolicyError(f"{file}: {problem}{reason}") from error
     return PolicyFile(file, content, card, taxel_tables(extra[TAXELS].decode()))
 
 
