@@ -355,7 +355,7 @@ def test_part_of_a_state_is_no_state(original, missing, strict):
     source(felt_state(source, NUM_ENVS))
     state = source.state_dict()
     del state[missing]
-    with pytest.raises(RuntimeError, match=f'"{missing}" is missing beside other state'):
+    with pytest.raises(RuntimeError, match=f'"{missing}" is missing, other state is there'):
         touch.load_state_dict(state, strict=strict)
     assert touch.num_envs is None
     touch(felt_state(touch, 2))

@@ -47,7 +47,7 @@ def load(
         kinds: Your own sensor kinds, if the artefact uses any that no installed package provides.
         dtype: Dtype of the readings, float32 or float64, as for `compile`, or its name.
         device: Device of the module.
-        taxels: The expected taxels, such as those of a policy: see `tgdsl.check_taxels`.
+        taxels: The expected taxels, such as a policy's: see `tgdsl.check_taxels`.
 
     Raises:
         ArtifactError: If the file is not an artefact, is damaged or is of another version.

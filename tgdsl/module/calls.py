@@ -36,10 +36,10 @@ def captured(call: Callable[[], Tensors]) -> tuple[Replay, Tensors]:
 
 
 class Graphed:
-    """A function of inputs and of memory that it changes in place, captured as a graph at the first call and replayed after it.
+    """A function that updates memory in place, captured as a CUDA graph at the first call and replayed afterwards.
 
-    The host's work for a call is a copy of the inputs and one launch. It is captured again when shapes or dtypes of the inputs
-    change, or memory lies elsewhere. What it returns is in the same tensors at each call.
+    Per call the host copies the inputs and launches once. The graph is captured again when shapes or dtypes of the inputs
+    change, or the memory has moved. All calls return the same tensors.
     """
 
     def __init__(self, function: Step, capture: Callable[[Callable[[], Tensors]], tuple[Replay, Tensors]] = captured):
@@ -47,27 +47,27 @@ class Graphed:
         self._key: object = None
 
     def __call__(self, tensors: Tensors, memory: Tensors) -> Tensors:
-        """Return what the function does of these tensors."""
+        """Return the function's outputs for these tensors."""
         shapes = [(name, value.shape, value.dtype) for name, value in tensors.items()]
         key = shapes, [(name, value.data_ptr(), value.shape) for name, value in memory.items()]
         if key != self._key:
             self._start(tensors, memory)
             self._key = key
-        for own, names in self._groups:
-            torch_internals.copy_each(own, [tensors[name] for name in names])
+        for static_inputs, names in self._groups:
+            torch_internals.copy_each(static_inputs, [tensors[name] for name in names])
         self._replay()
-        return dict(self._made)
+        return dict(self._outputs)
 
     def forget(self) -> None:
-        """Capture again at the next call: constants lie elsewhere."""
+        """Capture again at the next call: constants have moved."""
         self._key = None
 
     def _start(self, tensors: Tensors, memory: Tensors) -> None:
-        """Capture a call on inputs of its own; memory is then as it was before."""
+        """Capture a call on cloned inputs, then restore the memory."""
         with torch.inference_mode(False), torch.no_grad():
             inputs = {name: value.clone() for name, value in tensors.items()}
             old_memory = {name: value.clone() for name, value in memory.items()}
-            self._replay, self._made = self._capture(lambda: self._function(inputs, memory))
+            self._replay, self._outputs = self._capture(lambda: self._function(inputs, memory))
             for name, value in old_memory.items():
                 memory[name].copy_(value)
         dtypes = {value.dtype for value in inputs.values()}
@@ -81,14 +81,14 @@ class Calls:
     def __init__(self) -> None:
         self._wanted: tuple[bool, dict[str, Any]] | None = None
         self.compiled: dict[str, Step] = {}  # compiled steps, by their names; another dictionary after each `compile`
-        self.graphed: dict[str, Graphed] = {}  # the same as CUDA graphs, if those are wanted
+        self.graphed: dict[str, Graphed] = {}  # the same steps as CUDA graphs, if requested
 
     def compile(self, graph: bool, **options: Any) -> None:
-        """Have steps compiled when they are first called, and calls without derivatives replayed as CUDA graphs if wanted."""
+        """Compile each step at its first call; with `graph`, replay calls without derivatives as CUDA graphs."""
         self._wanted, self.compiled, self.graphed = (graph, options), {}, {}
 
     def of(self, step: Step) -> Step:
-        """Return what to call for a step: inside a capture of the caller's own, what a graph of ours would capture."""
+        """Return the callable for a step; inside a caller's graph capture, the function that our graph would capture."""
         name = step.__name__
         if self._wanted is not None and name not in self.compiled:
             graph, options = self._wanted
@@ -100,23 +100,22 @@ class Calls:
         return self.compiled.get(name, step)
 
     def forget_graphs(self) -> None:
-        """Capture again at the next calls: constants lie elsewhere."""
+        """Capture again at the next calls: constants have moved."""
         for graphed in self.graphed.values():
             graphed.forget()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what is compiled: it is bound to the module that this is of."""
+        """Leave out compiled steps: they are bound to this module."""
         return {"_wanted": self._wanted, "compiled": {}, "graphed": {}}
 
 
 def inductor_options(plan: Plan, quantities: Sequence[Quantity], device: torch.device) -> dict[str, Any]:
-    """Return what is asked of Inductor for a plan and the quantities that it asks for.
+    """Return Inductor's options for a plan and its quantities.
 
-    Kernels check that indices are in range only where some index is given by the user: a variant's or a material's number.
-    Where taxels of one link ask primitives for a depth or a distance and no more, blocks are tiles of environments and taxels:
-    what there is once per environment is loaded once per tile. With more links it is looked up per taxel, and with more to find
-    a tile takes too many registers. Where nothing but patches is asked for, kernels on a CPU are as large as can be: on a GPU
-    one kernel takes twice the time of three.
+    Kernels check the range of indices only if the user supplies some: variants or materials. If the taxels of one link query
+    primitives for a depth or a distance only, blocks are tiles of environments and taxels: values per environment are loaded
+    once per tile. With more links they are gathered per taxel, and with more outputs a tile takes too many registers. If
+    patches are the only quantity, kernels on a CPU are as large as possible: on a GPU one kernel takes twice as long as three.
     """
     is_slight = (
         all(quantity.is_light(plan.quantities[quantity.name]) for quantity in quantities)

@@ -1,4 +1,4 @@
-"""An account of a compiled module: what it computes, what it left out and why, and what that costs."""
+"""An account of a compiled module: computations, parts left out with reasons, and costs."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class OperationCounter(TorchDispatchMode):
     triangles what `geometry.bvh.query_operations` says; anything else one operation for each element that it writes.
 
     Attributes:
-        elements: What was counted so far.
+        elements: Operations counted so far.
     """
 
     def __init__(self) -> None:
@@ -105,8 +105,8 @@ def explain(touch: Explained) -> str:
     lines = [f"{plan.origin.robot}{plan.origin.at_resolution}, {plan.layout.num_taxels} taxels"]
     lines += [f"taxels_id {plan.taxels_id}", ""] if plan.layout.num_taxels else [""]
     lines += [*_links(plan), "", "sensors", *(f"  {line}" for sensor in plan.sensors for line in _sensor(touch, sensor))]
-    for asked in touch.quantities:
-        for headline, account in asked.account(plan.quantities[asked.name], plan.objects).items():
+    for requested in touch.quantities:
+        for headline, account in requested.account(plan.quantities[requested.name], plan.objects).items():
             lines += ["", headline, *(f"  {line}" for line in account)]
     lines += ["", *_observations(plan), *_inputs(plan)]
     if plan.dropped:
@@ -261,14 +261,14 @@ def _observations(plan: Plan) -> list[str]:
 def _inputs(plan: Plan) -> list[str]:
     inputs = plan.inputs
     contacts = {**inputs.contacts_of, **inputs.link_parts}
-    parts = [(name, ", ".join(f"{part.kind} {part.name}" for part in own)) for name, own in contacts.items()]
+    geoms_of = [(name, ", ".join(f"{part.kind} {part.name}" for part in parts)) for name, parts in contacts.items()]
     names = {"heated": inputs.heated, "joints": inputs.joints, "actuators": inputs.actuators}
     return [
         *("inputs wanted", f"  fields  {', '.join(inputs.fields)}", f"  bodies  {', '.join(inputs.bodies)}"),
         *([f"  pairs   {', '.join(f'{pair.link} – {pair.object}' for pair in inputs.pairs)}"] if inputs.pairs else []),
-        *(f"  contacts with {name} are those on {geoms}" for name, geoms in parts),
+        *(f"  contacts with {name} are those on {geoms}" for name, geoms in geoms_of),
         *([f"  slots   {inputs.slots} contacts of each pair"] if inputs.slots else []),
-        *(f"  {what}  {', '.join(own)}" for what, own in names.items() if own),
+        *(f"  {axis}  {', '.join(axis_names)}" for axis, axis_names in names.items() if axis_names),
         "",
     ]
 
@@ -280,14 +280,14 @@ def _costs(touch: Explained) -> list[str]:
     sizes = [_sizes(touch, sensor) for sensor in touch.plan.sensors]
     fixed = sum(state_bytes for state_bytes, _ in sizes) + (_CLOCK_BYTES if touch.memory.clock.is_wanted else 0)
     ring = sum(ring_bytes for _, ring_bytes in sizes)
-    beside = f", and {ring} for each call of the delays" if ring else ""
+    ring_text = f", and {ring} for each call of the delays" if ring else ""
     read = sum(getattr(state, n).numel() * 8 for n in touch.plan.inputs.fields if n != "dt")
     constants = sum(buffer.numel() * buffer.element_size() for buffer in touch.constants.buffers())
     return [
         "cost per environment",
         f"  reads        {read:>10} bytes (float64 state)",
         f"  writes       {size * outputs:>10} bytes of readings",
-        f"  remembers    {fixed:>10} bytes{beside}",
+        f"  remembers    {fixed:>10} bytes{ring_text}",
         f"  computes     {operations_per_env(touch):>10} elementary operations",
         f"constants      {constants:>12} bytes, once",
     ]

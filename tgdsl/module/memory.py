@@ -37,10 +37,10 @@ _INT64 = 2**63
 class Clock(HookedModule):
     """Counts calls and episodes of each environment. It holds nothing until `start`, nor if no sensor asks for it.
 
-    Buffers, all int64: `seed`, `first_env` (number of the first environment among those of all processes); per environment,
-    (env,): `step` (calls so far), `episode` (resets), `age` (calls since the last reset); and of the module's dtype `ages`
-    (env, call), how long before the last call each one was [s], itself first, and `time` (env,), of the last call since the
-    reset [s].
+    Buffers, all int64: `seed`, `first_env` (number of the first environment, counted over all processes); per environment,
+    (env,): `step` (calls so far), `episode` (resets), `age` (calls since the last reset). In the module's dtype: `ages`
+    (env, call), time from each call to the last one [s], the last call first; `time` (env,), from the reset to the last call
+    [s].
     """
 
     def __init__(self, sensors: Sequence[PlannedSensor]):
@@ -64,7 +64,7 @@ class Clock(HookedModule):
         return len(self.get_buffer("age")) if hasattr(self, "age") else None
 
     def start(self, num_envs: int, calls: int, like: Tensor) -> None:
-        """Begin to count; some ring remembers so many calls before the present one. `like`: the module's device and dtype."""
+        """Begin to count. `calls`: length of the longest ring [calls]; `like`: the module's device and dtype."""
         whole = {"device": like.device, "dtype": torch.int64}
         for name in ("seed", "first_env"):
             self.register_buffer(name, torch.zeros((), **whole))
@@ -74,14 +74,14 @@ class Clock(HookedModule):
             self.register_buffer("time", like.new_zeros(num_envs))
         if calls:
             self.register_buffer("ages", like.new_zeros(num_envs, calls))
-        # No number of a plan is read in `nows`: compiled code would be made twice, as it may be another at the next call.
+        # `nows` reads no number from the plan: the graph would be recompiled when the number changes.
         self.register_buffer("periods", like.new_tensor([sensor.period for sensor in self._sensors]), persistent=False)
         if self._keyed:
             self.register_buffer("keys", like.new_zeros(len(self._keyed), 2, dtype=torch.int32), persistent=False)
         self._restart()
 
     def free(self) -> None:
-        """Hold nothing again; the seed is kept."""
+        """Free all buffers; the seed stays."""
         _drop(self, "")
 
     def seed_with(self, seed: int, first_env: int | None) -> None:
@@ -176,14 +176,14 @@ class Clock(HookedModule):
             self.get_buffer("keys").copy_(torch.tensor(keys, dtype=torch.int32))
 
     def on_load(self, state_dict: dict[str, Any], prefix: str, errors: list[str], load: Callable[[], object]) -> None:
-        """Make room for the counts that are loaded, and go on with their seed; do nothing if `Memory` has found errors."""
+        """Allocate buffers for the loaded counts, and continue with their seed; do nothing if `Memory` reports errors."""
         if errors:
             return
         age, ages = state_dict.get(f"{prefix}age"), state_dict.get(f"{prefix}ages")
         if self.is_wanted and isinstance(age, Tensor):
             calls = ages.shape[-1] if isinstance(ages, Tensor) else 0
             held = self.get_buffer("ages").shape[-1] if hasattr(self, "ages") else 0
-            if (len(age), calls) != (self.num_envs, held):  # else captured graphs go on with what is there
+            if (len(age), calls) != (self.num_envs, held):  # else captured graphs keep using the buffers
                 with torch.inference_mode(False):
                     self.start(len(age), calls, self.home)
         load()
@@ -204,7 +204,7 @@ def _drop(module: HookedModule, prefix: str) -> None:
 
 
 class StateWatch:
-    """Warns, once, of state that kinds warn of, see `Kind.warns`: it sees what the calls before have left."""
+    """Emits the warnings of kinds about their state, each once, see `Kind.warns`; it checks the previous calls' state."""
 
     def __init__(self, sensors: Sequence[PlannedSensor], kinds: Mapping[str, Kind]):
         rows = {sensor.name: [f"{sensor.sensor}[{i}]" for i in range(sensor.readings[0].num_rows)] for sensor in sensors}
@@ -217,7 +217,7 @@ class StateWatch:
         self._num_calls = 0
 
     def look(self, memory: Mapping[str, Tensor]) -> None:
-        """Warn of what is new. What a GPU holds may be seen some calls later."""
+        """Emit new warnings. State on a GPU may be checked some calls later."""
         if not self._watched or torch.compiler.is_compiling():
             return
         self._num_calls += 1
@@ -320,17 +320,17 @@ class Memory(HookedModule):
                 raise StateError(f"{problem} {planned.past:g} s of so many calls; {hint}")
 
     def cache_readings(self, readings: Mapping[str, Tensor]) -> None:
-        """Note the readings that a call returns, (env, row, channel): where they lie, or once they are kept, that they are."""
+        """Remember a call's readings, (env, row, channel): references, or if copies are stored, only that they are."""
         self._is_filled = self.num_kept is not None
-        found = {} if self._is_filled else readings
-        self._last = {name: (reading.detach(), num_writes(reading)) for name, reading in found.items()}
+        unsaved = {} if self._is_filled else readings
+        self._last = {name: (reading.detach(), num_writes(reading)) for name, reading in unsaved.items()}
 
     def with_views(self, readings: Tensors) -> Tensors:
-        """Put the memory itself in the place of stacks that are declared as views."""
+        """Replace stacks declared as views by the memory itself."""
         return readings | {name: self.get_buffer(f"{WINDOW}{name}").transpose(2, 3) for name in self._views}
 
     def keep_last(self, num_envs: int) -> None:
-        """From now on keep what calls return, for the environments that a masked call leaves out."""
+        """Store the readings of calls from now on: masked calls return them for the environments left out."""
         if not (self._is_filled or self._last):
             raise StateError("nothing was handed out yet for the environments left out: read all of them first")
         if not self._is_filled:
@@ -347,26 +347,26 @@ class Memory(HookedModule):
             raise StateError(f"readings of {self.num_kept} environments were handed out before, the scene has {num_envs}")
 
     def keep_no_other(self, num_envs: int) -> None:
-        """Keep readings no longer if they are of another number of environments, which a module without state may change."""
+        """Drop stored readings if the number of environments differs; a module without state may change it."""
         if self.num_kept not in (None, num_envs):
             self._is_filled = False
             _drop(self, KEPT)
 
     def free(self) -> None:
-        """Hold nothing again, as before the first call."""
+        """Free all buffers, as before the first call."""
         _drop(self, "")
         self._last, self._is_filled = {}, False
         self.clock.free()
 
     def reset(self, chosen: Tensor) -> None:
-        """Begin a new episode in the environments of a mask; what noise and history remember restarts by its age."""
+        """Begin a new episode in the environments of a mask; noise and history restart by the clock's `age`."""
         for path, rest in self._restarted.items():
             buffer = self.get_buffer(path)
             buffer.masked_fill_(broadcast_over(chosen, buffer), rest)
         self.clock.reset(chosen)
 
     def restarted(self, memory: Mapping[str, Tensor], chosen: Tensor) -> Tensors:
-        """Return what `reset` makes of memory that is not held here."""
+        """Return memory after a reset, without changing it: `reset` for memory that the caller holds."""
         result = dict(memory)
         for path, rest in self._restarted.items():
             result[path] = memory[path].masked_fill(broadcast_over(chosen, memory[path]), rest)
@@ -381,9 +381,9 @@ class Memory(HookedModule):
         move()
 
     def on_load(self, state_dict: dict[str, Any], prefix: str, errors: list[str], load: Callable[[], object]) -> None:
-        """Make room for the state that is loaded, in the module's own dtype; part of a state is no state.
+        """Allocate buffers for the loaded state, in the module's own dtype; refuse an incomplete state.
 
-        Buffers that have the shape already stay where they are: captured graphs go on with them.
+        Buffers of the right shape are reused: captured graphs refer to them.
         """
         loaded = {path: state_dict[prefix + path] for path in self.planned if isinstance(state_dict.get(prefix + path), Tensor)}
         age = state_dict.get(f"{prefix}clock.age")
@@ -395,14 +395,14 @@ class Memory(HookedModule):
             for path, value in loaded.items():
                 if path not in (held := held_buffers(self)) or held[path].shape != value.shape:
                     self.register_buffer(path, torch.zeros(value.shape, dtype=self.home.dtype, device=self.home.device))
-        self._last, self._is_filled = {}, False  # what is replaced has returned them
+        self._last, self._is_filled = {}, False  # the replaced state returned them
         load()
 
     def _misfits(self, found: Mapping[str, Tensor], age: Tensor | None, prefix: str) -> list[str]:
-        """Return what is wrong with state that is to be loaded: parts that lack, or are not of the planned shape."""
+        """Return the errors of a state to load: missing parts, and parts of another shape than planned."""
         missing = [path for path in self.planned if path not in found]
         missing += ["clock.age"] if self.clock.is_wanted and age is None else []
-        wrong = [f'"{prefix}{path}" is missing beside other state' for path in missing]
+        wrong = [f'"{prefix}{path}" is missing, other state is there' for path in missing]
         counts = {len(value) for value in [*found.values(), *([] if age is None else [age])] if value.ndim}
         if len(counts) > 1:
             wrong.append(f'the parts of "{prefix}" are of {sorted(counts)} environments')
@@ -414,7 +414,7 @@ class Memory(HookedModule):
 
 
 def _calls(planned: PlannedMemory, dt: float | None) -> tuple[int, ...]:
-    """Return how many calls before the present one a ring holds; nothing if it is none."""
+    """Return how many earlier calls a ring holds; empty if there is no ring."""
     if planned.past == 0 or dt is None:
         return ()
     return (max(math.ceil(planned.past / dt - 1e-6), 1),)
@@ -423,7 +423,7 @@ def _calls(planned: PlannedMemory, dt: float | None) -> tuple[int, ...]:
 def pushed(window: Window, reading: Float[Tensor, "env row channel"], age: Int[Tensor, " env"]) -> Window:
     """Return a window after a call; `age`: calls since each environment's reset, before this one.
 
-    Before there are enough calls since a reset, the first one stands for the missing. The reading's gradients are kept.
+    After a reset the first call fills the window. Gradients flow through the reading.
     """
     newest = reading.transpose(1, 2)[:, None]
     moved = torch.cat([window[:, 1:], newest], dim=1)
@@ -431,7 +431,7 @@ def pushed(window: Window, reading: Float[Tensor, "env row channel"], age: Int[T
 
 
 def reduced(window: Window, reduce: str) -> Float[Tensor, "env *step row channel"]:
-    """Return what is read of a window: all of it (`stack`), or the `mean` or `median` of each number."""
+    """Return a window's reading: all of it (`stack`), or the `mean` or `median` over its calls."""
     if reduce == "stack":
         return window.transpose(2, 3)
     if reduce == "mean":
@@ -441,12 +441,12 @@ def reduced(window: Window, reduce: str) -> Float[Tensor, "env *step row channel
 
 
 def last_step(reading: Float[Tensor, "env *step row channel"]) -> Float[Tensor, "env row channel"]:
-    """Return the last one of stacked calls, or a reading that is of one call."""
+    """Return the last of stacked calls; a reading of one call is returned as it is."""
     return reading[:, -1] if reading.ndim == 4 else reading
 
 
 def store(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor]) -> None:
-    """Put new state in the place of the old one; of a ring, this call's entry."""
+    """Overwrite the old state; in a ring, this call's entry."""
     with torch.no_grad():
         for name, value in updated.items():
             if value.ndim < memory[name].ndim:
@@ -457,7 +457,7 @@ def store(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor]) -> None:
 
 
 def stored(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor]) -> Tensors:
-    """Return memory with new state in the place of the old one, as `store` writes it; derivatives go through it."""
+    """Return memory with the new state, as `store` writes it, without detaching derivatives."""
     result = {**memory, **updated}
     for name, value in updated.items():
         if value.ndim < memory[name].ndim:
@@ -465,8 +465,8 @@ def stored(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor]) -> Tenso
     return result
 
 
-def kept(readings: Mapping[str, Tensor], memory: Mapping[str, Tensor]) -> Tensors:
-    """Return what is kept of readings that a call returns, if anything is."""
+def last_readings(readings: Mapping[str, Tensor], memory: Mapping[str, Tensor]) -> Tensors:
+    """Return a call's readings as the memory stores them, if it stores any."""
     return {f"{KEPT}{name}": reading.transpose(-2, -1) for name, reading in readings.items() if f"{KEPT}{name}" in memory}
 
 
@@ -479,7 +479,7 @@ def _entry_of(memory: Mapping[str, Tensor], name: str) -> tuple[Tensor, Tensor]:
 def chosen_rows(
     mask: Bool[Tensor, " env"], readings: Tensors, updated: Tensors, memory: Mapping[str, Tensor]
 ) -> tuple[Tensors, Tensors]:
-    """Return readings and new state of the environments of a mask; of the others, what they had and last read."""
+    """Return readings and new state in the environments of a mask; elsewhere, the last readings and the old state."""
     selected, result = {}, dict(readings)
     for name, value in updated.items():
         old = memory[name] if value.ndim == memory[name].ndim else memory[name][_entry_of(memory, name)]

@@ -24,7 +24,7 @@ from tgdsl.errors import StateError, TgdslError
 from tgdsl.module.calls import Calls, cpp_compiler, inductor_options
 from tgdsl.module.explain import Explained, explain, operations_per_env
 from tgdsl.module.export.program import EXAMPLE_ENVS, Signature, Step, export_step, format_of
-from tgdsl.module.memory import Memory, chosen_rows, kept, store, stored
+from tgdsl.module.memory import Memory, chosen_rows, last_readings, store, stored
 from tgdsl.module.outputs import ObservationTerm, Output, observation_terms, observe, outputs_of
 from tgdsl.module.sensing import Sensing, bind, constant_arrays, in_order, sense
 from tgdsl.module.state import SHAPES, Incoming, SceneState, example_state, shape_of
@@ -157,7 +157,7 @@ class TactileModule(HookedModule):
         tensors, num_envs = self._tensors(state)
         step = "advance"
         if mask is not None or env_ids is not None:
-            step, tensors["mask"] = "advance_some", self.incoming.chosen(mask, env_ids, num_envs, self.device)
+            step, tensors["mask"] = "advance_some", self.incoming.mask_of(mask, env_ids, num_envs, self.device)
             self.memory.keep_last(num_envs)
         else:
             self.memory.keep_no_other(num_envs)
@@ -215,9 +215,9 @@ class TactileModule(HookedModule):
         self, tensors: Mapping[str, Tensor], memory: Mapping[str, Tensor], reset: Tensor | None
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Do what `step` does with the fields of a state that `inputs` names, traceable in one graph."""
-        before = dict(memory) if reset is None else self.memory.restarted(memory, reset)
-        readings, updated = self.core(dict(tensors), before)
-        return {name: readings[name] for name in self.plan.readings()}, stored(before, updated)
+        old_memory = dict(memory) if reset is None else self.memory.restarted(memory, reset)
+        readings, updated = self.core(dict(tensors), old_memory)
+        return {name: readings[name] for name in self.plan.readings()}, stored(old_memory, updated)
 
     def export(
         self,
@@ -287,13 +287,13 @@ class TactileModule(HookedModule):
     def advance(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings of `core`, and replace the old state with the new one."""
         readings, updated = self._read(tensors, memory)
-        store(memory, updated | kept(readings, memory))
+        store(memory, updated | last_readings(readings, memory))
         return readings
 
     def advance_some(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Advance the environments of `tensors["mask"]`; return their readings, and the last readings of the others."""
         readings, updated = chosen_rows(tensors["mask"], *self.core(tensors, memory), memory)
-        store(memory, updated | kept(readings, memory))
+        store(memory, updated | last_readings(readings, memory))
         return readings
 
     def look(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -393,7 +393,7 @@ class TactileModule(HookedModule):
         if graph and self.device.type != "cuda":
             raise TgdslError(f"`graph` needs a module on a GPU, this one is on {self.device}")
         if self.device.type == "cpu" and cpp_compiler() is None:
-            warnings.warn("no C++ compiler (g++, clang++ or $CXX) was found: the module stays eager", stacklevel=2)
+            warnings.warn("found no C++ compiler (g++, clang++ or $CXX): the module stays eager", stacklevel=2)
             return self
         defaults: dict[str, Any] = {"fullgraph": True, "dynamic": True}
         if not {"mode", "options", "backend"} & options.keys():

@@ -41,12 +41,12 @@ class Output:
 
 
 def outputs_of(plan: Plan) -> tuple[Output, ...]:
-    """Return name, shape, channels and units of each reading of a plan; a tuple that prints as a table."""
-    own = {reading.name: sensor for sensor in plan.sensors for reading in sensor.readings}
+    """Return name, shape, channels and units of a plan's readings; the tuple prints as a table."""
+    sensors = {reading.name: sensor for sensor in plan.sensors for reading in sensor.readings}
     outputs = []
     for name, reading in plan.readings().items():
-        sensor, kind = (own[name].sensor, own[name].kind) if name in own else (name, name)
-        bodies = plan.layout_of(own[name]).bodies if name in own else ()
+        sensor, kind = (sensors[name].sensor, sensors[name].kind) if name in sensors else (name, name)
+        bodies = plan.layout_of(sensors[name]).bodies if name in sensors else ()
         outputs.append(Output(name, sensor, kind, reading.shape, reading.rows, bodies, reading.channels, reading.units))
     return Outputs(outputs)
 
@@ -108,7 +108,7 @@ def observe(
 
 
 def _checked(plan: Plan, readings: Mapping[str, Tensor]) -> int:
-    """Validate the readings that are observed, and return of how many environments they are."""
+    """Validate the observed readings and return their number of environments."""
     planned = plan.readings()
     for term in plan.observations:
         if term.type in HAND_ONLY:

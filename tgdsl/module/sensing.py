@@ -68,18 +68,18 @@ def _is_prepared(record: Any) -> bool:
 
 
 class Sensing(NamedTuple):
-    """What a plan is computed with."""
+    """A plan with its kinds, quantities and noise stages."""
 
     plan: Plan
     kinds: Mapping[str, Kind]  # the kind of each sensor, by the sensor's name
     quantities: tuple[Quantity, ...]  # the quantities that some sensor asks for
     stages: Mapping[str, Sequence[StageType]]  # the stages of each sensor's noise, by the sensor's name
     clock: Clock  # says when sensors are read
-    order: tuple[PlannedSensor, ...]  # the sensors, each after those that it reads
+    order: tuple[PlannedSensor, ...]  # the sensors, each after the sensors that it reads
 
 
 def in_order(sensors: Sequence[PlannedSensor]) -> tuple[PlannedSensor, ...]:
-    """Return sensors so that each is after those that it reads; else as they are given."""
+    """Return sensors in topological order: each after the sensors that it reads, otherwise in the given order."""
     ordered: dict[str, PlannedSensor] = {}
     while len(ordered) < len(sensors):
         ready = [s for s in sensors if s.name not in ordered and all(name in ordered for name in s.upstream)]
@@ -94,11 +94,11 @@ def sense(
 ) -> tuple[Tensors, Tensors]:
     """Return the readings of all sensors, and their new state: a pure function, traceable in one graph.
 
-    `own` has the plan's parts, bound to constants; `tensors` the fields of `SceneState` that `inputs` names, those of earlier
-    substeps as `substep/<i>/<field>`; `memory` the state by `sensor:name`, each (env, …), and the clock's.
+    `own` has the plan's parts, bound to constants; `tensors` the fields of `SceneState` that `inputs` names, earlier substeps
+    as `substep/<i>/<field>`; `memory` the state by `sensor:name`, each (env, …), and the clock's.
 
-    Readings are by name, with signals before their noise as `<sensor>/signal`. The new state has of a ring, (env, call, …), its
-    new entry, (env, …). A kernel may write new state over the old, which is then not returned.
+    Readings are by name, with signals before their noise as `<sensor>/signal`. For a ring, (env, call, …), the new state is its
+    new entry, (env, …). State that a kernel updates in place is not returned.
     """
     plan, dt = sensing.plan, tensors.get("dt")
     nows = sensing.clock.nows(memory, dt)
@@ -150,7 +150,7 @@ def scene_of(
     noise: Mapping[str, Sequence[Stage]],
     dtype: torch.dtype,
 ) -> Scene:
-    """Return what quantities are gathered from; stages of noise may disturb the taxels' radii."""
+    """Return the scene from which quantities are gathered; noise stages may disturb the taxels' radii."""
     shifts, pairs = {}, None
     for sensor in plan.sensors:
         for stage in noise.get(sensor.name, ()):
@@ -166,14 +166,14 @@ def scene_of(
 
 
 def _gathered(sensing: Sensing, own: Tree, scene: Scene) -> dict[str, Gathered]:
-    """Return what each sensor asked for."""
+    """Return the gathered values of each sensor."""
     values = [(quantity, quantity.gather(own["quantities"][quantity.name], scene)) for quantity in sensing.quantities]
-    for quantity, found in values:
-        if not isinstance(found, (tuple, list)):
-            problem = f"expected a tuple with a value for each use, found {type(found).__name__}"
+    for quantity, answer in values:
+        if not isinstance(answer, (tuple, list)):
+            problem = f"expected a tuple with a value for each use, found {type(answer).__name__}"
             raise TgdslError(f'`gather` of the quantity "{quantity.name}": {problem}')
-        for sensor in (sensor for sensor in sensing.plan.sensors if sensor.uses.get(quantity.name, -1) >= len(found)):
-            problem = f'{len(found)} values, and sensor "{sensor.name}" has use {sensor.uses[quantity.name]} (from 0)'
+        for sensor in (sensor for sensor in sensing.plan.sensors if sensor.uses.get(quantity.name, -1) >= len(answer)):
+            problem = f'{len(answer)} values, and sensor "{sensor.name}" has use {sensor.uses[quantity.name]} (from 0)'
             raise TgdslError(f'`gather` of the quantity "{quantity.name}" returns {problem}; expected one for each use')
     return {
         sensor.name: Gathered({q.request: of[sensor.uses[q.name]] for q, of in values if q.name in sensor.uses})
@@ -190,7 +190,7 @@ def _with_upstream(sensor: PlannedSensor, gathered: Gathered, answers: Mapping[s
 def _joined_signal(
     sensing: Sensing, own: Tree, sensor: PlannedSensor, gathered: Gathered
 ) -> Float[Tensor, "env channel taxel"]:
-    """Return the signals of sensors that are computed as one, one sensor's taxels after the other's."""
+    """Return the concatenated signals of sensors that are computed as one."""
     by_name, kind = {other.name: other for other in sensing.plan.sensors}, sensing.kinds[sensor.joined[0]]
     sensors = [by_name[name] for name in sensor.joined]
     of_taxels: Tensors = {}
@@ -323,7 +323,7 @@ def _kind_state(sensor: PlannedSensor, memory: Mapping[str, Tensor]) -> Tensors:
 
 
 def _phase(phase: Float[Tensor, " env"], period: Tensor, now: Now) -> Float[Tensor, " env"]:
-    """Return the time since a sample was due [s]: from −dt/2 on, as samples are taken at the call that is nearest."""
+    """Return the time since a sample was due [s], at least −dt/2: each sample is read at the nearest call."""
     assert now.dt is not None
     since = phase + now.dt
     whole = torch.floor((since + 0.5 * now.dt) / period).clamp(min=0)

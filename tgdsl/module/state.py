@@ -1,4 +1,4 @@
-"""The state of a scene: what a module reads of simulators and hardware.
+"""The state of a scene: a module's input from simulators and hardware.
 
 Shapes: `env` environments, `body` bodies of a module's `inputs.bodies`, `pair` pairs of its `inputs.pairs`, `slot` contacts per
 pair, `object` objects of its `inputs.objects`, `heated` objects of its `inputs.heated`, `joint` joints of its `inputs.joints`,
@@ -26,7 +26,7 @@ from tgdsl.tensors.buffers import Constants
 from tgdsl.tensors.env_ids import EnvIds, env_mask, is_out_of_sight
 from tgdsl.tensors.on_host import HostCopy
 
-CHOICES = ("variant", "object_material")  # fields that say which of several things an object is: integers
+CHOICES = ("variant", "object_material")  # integer fields: indices into an object's variants and materials
 
 
 @dataclass
@@ -48,7 +48,7 @@ class SceneState:
         body_linvel: Velocity of the body frame's origin, not of the centre of mass [m/s].
         body_angvel: Angular velocity of the body [rad/s].
         contact_found: Whether each (link, object) pair is in contact: boolean, or a number that is positive in contact, such
-            as the number of contacts. `inputs.parts_of` lists the geoms of an object, `inputs.parts_of_link` those of a link.
+            as the number of contacts. `inputs.parts_of` lists an object's geoms, `inputs.parts_of_link` a link's.
         contact_pos: Contact points [m].
         contact_force: Force on the link at each point [N].
         contact_torque: Torque on the link at each point [N·m].
@@ -92,7 +92,7 @@ class SceneState:
     substeps: tuple[SceneState, ...] = ()
 
     def to(self, *args: Any, **kwargs: Any) -> SceneState:
-        """Return the state with `torch.Tensor.to` applied to every tensor; a dtype applies to what is not an integer."""
+        """Return the state with `torch.Tensor.to` applied to every tensor; a dtype does not apply to integers."""
         values: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
         moved: dict[str, Any] = {n: v.to(*args, **kwargs) if isinstance(v, Tensor) else v for n, v in values.items()}
         for name in CHOICES:
@@ -102,9 +102,9 @@ class SceneState:
         return SceneState(**moved)
 
     def checked(self, inputs: Inputs, device: torch.device, with_dt: bool = True) -> dict[str, Tensor]:
-        """Return the tensors that a module on a device reads; `with_dt`: whether a time must be there, if it is read."""
-        wanted = [name for name in inputs.fields if name != "dt" or with_dt]
-        if missing := [name for name in wanted if getattr(self, name) is None]:
+        """Return the tensors that a module on a device reads; `with_dt`: whether `dt` is required, if it is read."""
+        required = [name for name in inputs.fields if name != "dt" or with_dt]
+        if missing := [name for name in required if getattr(self, name) is None]:
             hint = "; set `state.dt` to the seconds since the last call" if "dt" in missing else ""
             raise StateError(f"SceneState lacks {', '.join(missing)}, which this module reads{hint}")
         tensors = {name: _checked(name, getattr(self, name), inputs, device) for name in inputs.fields if name != "dt"}
@@ -112,7 +112,7 @@ class SceneState:
         for name, value in tensors.items():
             if value.shape[0] != num_envs:
                 raise StateError(f"SceneState.{name} holds {value.shape[0]} environments, body_pos {num_envs}")
-        if device.type == "cpu":  # a look at a GPU's numbers would wait for it; there the kernel asserts
+        if device.type == "cpu":  # on a GPU this would synchronise; there the kernel asserts
             _check_choices("variant", tensors, inputs.objects, inputs.num_variants)
             _check_choices("object_material", tensors, inputs.heated, inputs.num_materials)
         return tensors
@@ -136,7 +136,7 @@ def _check_choices(field: str, tensors: Mapping[str, Tensor], names: Sequence[st
 
 
 def shape_of(name: str, inputs: Inputs) -> tuple[int, ...]:
-    """Return the shape that a field has for a module, after the leading `env`."""
+    """Return a field's shape for a module, after the leading `env`."""
     return tuple([inputs.sizes[part] if isinstance(part, str) else part for part in SHAPES[name]])
 
 
@@ -208,8 +208,8 @@ def _contacts(values: Mapping[str, Tensor], inputs: Inputs, spread: float) -> di
     return {**result, "contact_netforce": result["contact_force"].sum(dim=2)}
 
 
-TOLERANCE = 1e-3  # part of a pair's force that slots may lack unnoticed: far above what single precision makes of a sum
-SAME_TIME = 1e-9  # relative difference up to which two times are one: rounding, where a call's time is divided by its substeps
+TOLERANCE = 1e-3  # part of a pair's force that slots may lack unnoticed: far above the rounding of a single-precision sum
+SAME_TIME = 1e-9  # relative difference up to which two times are equal: rounding of a call's time divided by its substeps
 
 
 class SlotWatch:
@@ -230,7 +230,7 @@ class SlotWatch:
         return len(self._warned) >= self._num_pairs
 
     def note(self, tensors: Mapping[str, Tensor]) -> None:
-        """Check a state, on its device; on a GPU one in `EVERY`, as a dozen small kernels take as long as a module's own."""
+        """Check a state on its device; on a GPU one in `EVERY`: the check's small kernels take as long as a module's."""
         whole, force, count = (tensors[f"contact_{name}"] for name in ("netforce", "force", "found"))
         self._num_calls += 1
         if whole.is_cuda and self._num_calls % EVERY != 1 and not torch.cuda.is_current_stream_capturing():
@@ -242,13 +242,13 @@ class SlotWatch:
         with torch.no_grad():
             lacking = (whole - force.sum(dim=2)).abs().amax(dim=-1)
             largest = force.abs().amax(dim=(2, 3))
-            slots = count.to(torch.float32).clamp(min=self._inputs.slots + 0.5)  # a state may not count its contacts
+            slots = count.to(torch.float32).clamp(min=self._inputs.slots + 0.5)  # a state's count may be a boolean
             is_crowded = (count > self._inputs.slots) & (largest > 0)
             slots = torch.where((lacking > TOLERANCE * (whole.abs().amax(dim=-1) + largest)) | is_crowded, slots, 0.0)
             self._wanted.copy_(torch.cat([self._wanted[None], slots]).amax(dim=0))
 
     def warn(self) -> None:
-        """Warn of what has been noted. A GPU is not waited for: what it notes may be seen a call or more later."""
+        """Warn of crowded pairs. It does not synchronise with a GPU: the warning may come a call or more later."""
         num_contacts = None if self._wanted is None else self._copy.poll(self._wanted)
         numbers = [] if num_contacts is None else num_contacts.tolist()
         new = [i for i, number in enumerate(numbers) if number and i not in self._warned]
@@ -263,7 +263,7 @@ class SlotWatch:
 
 
 class Incoming:
-    """Takes states apart for a module, and warns once of what is odd about them."""
+    """Reads a module's tensors from states, and warns once of each oddity."""
 
     def __init__(self, plan: Plan, kinds: Mapping[str, Kind], constants: Constants):
         self._plan, self._kinds, self._constants = plan, kinds, constants
@@ -274,11 +274,11 @@ class Incoming:
 
     @property
     def held_dt(self) -> object:
-        """Stands for the time between calls as a tensor: another object after it was written again."""
+        """The time between calls and its tensor: another object after each change."""
         return self._dt
 
     def tensors(self, state: SceneState, dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
-        """Return the fields of a state that are read, by name; those of earlier substeps as `substep/<i>/<field>`."""
+        """Return the fields that are read, by name; fields of earlier substeps as `substep/<i>/<field>`."""
         inputs = self._plan.inputs
         if not isinstance(state, SceneState):
             problem = f"a module reads a tgdsl.SceneState, found {type(state).__name__}"
@@ -289,7 +289,7 @@ class Incoming:
         if not self.slot_watch.is_done and not torch.compiler.is_compiling():
             self.slot_watch.note(tensors)
             self.slot_watch.warn()
-        # Our simulators, which say the time, notice faults themselves.
+        # Our simulators, which set the time, detect faults themselves.
         if state.time is None and "poses" not in self._warned and not is_out_of_sight(tensors["body_pos"]):
             self._check_poses(tensors)
         if inputs.substeps > 1:
@@ -297,8 +297,8 @@ class Incoming:
         return tensors
 
     @staticmethod
-    def chosen(mask: Tensor | None, env_ids: EnvIds | None, num_envs: int, device: torch.device) -> Bool[Tensor, " env"]:
-        """Return a mask of the environments that a caller chose, by a mask or by indices."""
+    def mask_of(mask: Tensor | None, env_ids: EnvIds | None, num_envs: int, device: torch.device) -> Bool[Tensor, " env"]:
+        """Return the mask of the environments that a caller selects by a mask or by indices."""
         if mask is not None and env_ids is not None:
             raise StateError("found both `mask` and `env_ids`, expected one of them")
         if mask is not None and not (isinstance(mask, Tensor) and mask.dtype == torch.bool and mask.shape == (num_envs,)):
@@ -331,7 +331,7 @@ class Incoming:
             self._warned.add("poses")
             envs = listed([str(env) for env in is_bad.nonzero().flatten().tolist()])
             problem = f"poses of bodies are not finite in environments {envs}: what depends on them is read as not-a-number"
-            warnings.warn(f"{problem}; this is said once, and not of states on a GPU: look for NaN in readings", stacklevel=7)
+            warnings.warn(f"{problem}; warned once, and never of states on a GPU: look for NaN in readings", stacklevel=7)
 
     def _dt_tensor(self, dt: float, dtype: torch.dtype, device: torch.device) -> Tensor:
         """Return dt as a tensor that is written only when it changes."""
@@ -348,7 +348,7 @@ class Incoming:
         return self._dt[1]
 
     def _retime(self, dt: float) -> None:
-        """Recompute constants that are made for another time between the calls of a kind, and warn of it the first time."""
+        """Recompute a kind's constants for another time between its calls, and warn the first time."""
         for sensor in (sensor for sensor in self._plan.sensors if sensor.name in self._timesteps):
             step_dt, retimed = dt / max(sensor.substeps, 1), self._kinds[sensor.name].retimed
             if math.isclose(step_dt, self._timesteps[sensor.name], rel_tol=SAME_TIME):

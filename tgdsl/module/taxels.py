@@ -1,4 +1,4 @@
-"""Where the taxels of a module are, as tables and images, and whether they are those of something else; artefacts' files.
+"""The taxels of a module as tables and images, the check that two modules' taxels agree, and artefacts' files.
 
 Shapes: `env` environments, `taxel` taxels of one sensor, `channel` numbers per taxel, `row`, `column` cells of a link's grid.
 """
@@ -47,8 +47,8 @@ def load_plan(path: str | PathLike[str], quantities: Sequence[Quantity] = QUANTI
     """Read an artefact that may ask for some quantities. Only the artefact itself is opened: no file that it names.
 
     Raises:
-        ArtifactError: If the file is not an artefact, is damaged, is of another version, or names files in places where those
-            of an artefact cannot be.
+        ArtifactError: If the file is not an artefact, is damaged, is of another version, or names files in places where an
+            artefact's files cannot be.
     """
     if Path(path).is_dir():
         raise ArtifactError(f"{path}: this is a folder, expected an artefact such as {Path(path) / 'hand.safetensors'}")

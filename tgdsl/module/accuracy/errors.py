@@ -37,7 +37,7 @@ class Magnitude(NamedTuple):
     active: Bool[np.ndarray, "step env row channel"]  # where the exact reading is not at its median
 
     def of(self, envs: slice, channels: Sequence[int]) -> Magnitude:
-        """Return that of some channels, in some environments."""
+        """Return the magnitude of some channels in some environments."""
         return Magnitude(self.rest[channels], self.scale[channels], self.active[:, envs][..., channels])
 
 
@@ -46,14 +46,14 @@ class Errors(NamedTuple):
 
     rms: Interval  # root of the sum of squared errors over the number of active readings
     largest: Interval  # the largest
-    p99: float  # what 99 of 100 active readings' errors do not exceed; errors of the others count too
+    p99: float  # 99th percentile over the number of active readings; errors of inactive readings count too
     is_finite: bool  # whether all readings are finite numbers
 
 
 def halves(num_envs: int) -> tuple[slice, slice]:
-    """Return the environments on which variants are compared, and those that take no part in it and verify.
+    """Return the environments that choose between variants and the environments that verify the choice.
 
-    Objects that differ between environments do so by `env % number`, so that a half has all of them, and every second one not.
+    Objects vary by `env % number`: each half of consecutive environments has all of them, every second environment has not.
     """
     half = (num_envs + 1) // 2
     return slice(0, half), slice(half, num_envs)

@@ -107,8 +107,8 @@ class Common(NamedTuple):
 def common_of(own: TactileModule, other: TactileModule, name: str) -> Common:
     """Return what another module's reading has in common with a module's.
 
-    Rows are compared with that of the same link whose place is nearest, or with the mean of several that are as near. Samples
-    of a block, the last of which is at its end, are compared where both have one. Channels go by their names.
+    A row is compared with the nearest row on the same link, or with the mean of equally near rows. A block's last sample is at
+    its end; samples are compared at times that both blocks have. Channels are matched by name.
     """
     one, two = (next(output for output in touch.outputs if output.name == name) for touch in (own, other))
     there = _rows_at(own, other, name)

@@ -20,9 +20,9 @@ class Variant:
 
     label: str  # what to call it
     changes: Mapping[str, Any] = field(default_factory=dict)  # changed fields by dotted path: `sensors.skin.operator`
-    is_own: bool = False  # whether it is what the document says
-    is_free: bool = True  # whether it may be chosen: it changes nothing that somebody wrote, nor what is read
-    is_exact: bool = False  # whether it is exact but for rounding
+    is_own: bool = False  # whether it is the document's own variant
+    is_free: bool = True  # whether it may be chosen: it changes no field that the document sets, and no reading
+    is_exact: bool = False  # whether it is exact up to rounding
 
     def joined(self, other: Variant) -> Variant:
         """Return the variant that has the changes of both."""
@@ -34,9 +34,9 @@ class Variant:
 class Variants:
     """The variants of a sensor, from coarse to fine; each changes one thing of the document."""
 
-    own: Variant  # what the document says
+    own: Variant  # the document's variant
     fields: tuple[Variant, ...]  # other choices of the sensor's fields
-    queries: tuple[Variant, ...]  # other ways to find distances to the meshes that it feels
+    queries: tuple[Variant, ...]  # other distance queries to the meshes that it senses
 
 
 def bare(name: str) -> dict[str, Any]:
@@ -49,7 +49,7 @@ def variants_of(
 ) -> Variants:
     """Return the variants of a sensor.
 
-    `queries` has the fields of the objects with meshes that it feels, `alternatives` how distances to meshes may be found.
+    `queries` has the fields of the sensed objects with meshes, `alternatives` the distance queries available for meshes.
     """
     fields = _variants((f"sensors.{name}",), (spec,), kind.alternatives(spec))
     ways = _variants(tuple(f"objects.{query}" for query in queries), tuple(queries.values()), alternatives) if queries else ()
@@ -69,12 +69,12 @@ def _variants(paths: Sequence[str], specs: Sequence[Any], alternatives: Sequence
 
 
 def is_taken(spec: Any, alternative: Alternative) -> bool:
-    """Return whether a sensor's or an object's fields are those of an alternative already."""
+    """Return whether a sensor's or an object's fields already have an alternative's values."""
     return all(_is_same(getattr(spec, key), value) for key, value in alternative.changes.items())
 
 
 def is_free(spec: Any, alternative: Alternative) -> bool:
-    """Return whether an alternative may be chosen: it changes nothing that is written, uses all of it, and reads the same."""
+    """Return whether an alternative may be chosen: it keeps and uses every field that is set, and reads the same."""
     if alternative.is_other and not is_taken(spec, alternative):
         return False
     changes = alternative.changes

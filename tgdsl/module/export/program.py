@@ -1,7 +1,7 @@
 """A module's step as a file that runs without tgdsl: torch.export's, AOTInductor's or ONNX.
 
-A step is a graph of torch's own operations with flat inputs and outputs and any number of environments. Its signature says what
-goes in and comes out, in order: text beside the program in the same file.
+A step is a graph of torch's own operations with flat inputs and outputs and any number of environments. Its signature lists
+inputs and outputs in order, as text in the same file.
 
 Shapes: `env` environments.
 """
@@ -63,10 +63,10 @@ class Signature:
 
     inputs: tuple[Port, ...]
     outputs: tuple[Port, ...]
-    dt: float | None  # time between steps that the program is made for [s]; None if nothing depends on it
+    dt: float | None  # time between the program's steps [s]; None if nothing depends on it
     taxels_id: str  # see `TactileModule.taxels_id`
     source: str  # document or artefact that it was exported from; empty if it was a module in memory
-    overrides: tuple[str, ...]  # what was overridden of the document
+    overrides: tuple[str, ...]  # the document's overrides
     version: str  # of tgdsl
     format: int = FORMAT
 
@@ -103,7 +103,7 @@ def read_signature(path: Path) -> Signature:
 
 
 class Step(NamedTuple):
-    """What is exported of a module."""
+    """The parts of a module that are exported."""
 
     plan: Plan
     constants: nn.Module
@@ -137,10 +137,10 @@ class FlatStep(nn.Module):
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         """Return readings, observations and the memory after the step."""
-        given = dict(zip(self.example, tensors, strict=True))
-        for name, tensor in given.items():
+        inputs = dict(zip(self.example, tensors, strict=True))
+        for name, tensor in inputs.items():
             assert_dtype(tensor, self.example[name].dtype)
-        return tuple(self.outputs(given).values())
+        return tuple(self.outputs(inputs).values())
 
     def outputs(self, given: Tensors) -> dict[str, Tensor]:
         """Return the outputs by name."""
@@ -170,8 +170,8 @@ def export_step(step: Step, path: Path, to: File, options: dict[str, Any], sourc
     program, text = _traced(flat, step.plan), {Path(ENTRY).stem: signature.to_json()}
     with atomic_path(path) as temporary:
         if to == "onnx":
-            given, returned = ([port.name for port in ports] for ports in (inputs, results))
-            write_onnx(_without_strides(program), given, returned, text, temporary)
+            input_names, output_names = ([port.name for port in ports] for ports in (inputs, results))
+            write_onnx(_without_strides(program), input_names, output_names, text, temporary)
         elif to == "pt2":
             torch.export.save(program, str(temporary), extra_files={ENTRY: signature.to_json()})
         else:
@@ -244,10 +244,10 @@ def _traced(flat: FlatStep, plan: Plan) -> torch.export.ExportedProgram:
 
 
 def _is_on_host(part: Any) -> bool:
-    """Return whether triangles are searched for some use of a quantity."""
-    found: list[bool] = []
-    tree.mapped(part, lambda array: array, lambda record: bool(found.append(getattr(record, "stays_on_host", False))))
-    return any(found)
+    """Return whether some use of a quantity searches triangles on the host."""
+    flags: list[bool] = []
+    tree.mapped(part, lambda array: array, lambda record: bool(flags.append(getattr(record, "stays_on_host", False))))
+    return any(flags)
 
 
 def _without_strides(program: torch.export.ExportedProgram) -> torch.export.ExportedProgram:

@@ -58,15 +58,15 @@ def differences(program: Callable[[Arrays], Arrays], signature: dict, record: st
     error: dict[str, np.ndarray] = {}
     scale: dict[str, np.ndarray] = {}
     for call in range(num_calls):
-        given = [memory[p["name"]] if p["name"] in memory else calls[f"{call}/{p['name']}"] for p in inputs]
-        result = dict(zip(outputs, program(given), strict=True))
+        arguments = [memory[p["name"]] if p["name"] in memory else calls[f"{call}/{p['name']}"] for p in inputs]
+        result = dict(zip(outputs, program(arguments), strict=True))
         memory = {f"memory/{name[5:]}": value for name, value in result.items() if name.startswith("next/")}
         for name in (name for name in outputs if not name.startswith("next/")):
-            found, expected = result[name].astype(np.float64), calls[f"{call}/{name}"].astype(np.float64)
-            if not np.array_equal(np.isnan(found), np.isnan(expected)):
+            actual, expected = result[name].astype(np.float64), calls[f"{call}/{name}"].astype(np.float64)
+            if not np.array_equal(np.isnan(actual), np.isnan(expected)):
                 raise SystemExit(f"{name}: other numbers are NaN at call {call} of {num_envs} environments")
-            axes = tuple(range(found.ndim - name.startswith("reading/")))
-            largest = [np.nanmax(np.abs(x), axis=axes, initial=0.0) for x in (found - expected, expected)]
+            axes = tuple(range(actual.ndim - name.startswith("reading/")))
+            largest = [np.nanmax(np.abs(x), axis=axes, initial=0.0) for x in (actual - expected, expected)]
             error[name] = np.maximum(error.get(name, 0.0), largest[0])
             scale[name] = np.maximum(scale.get(name, 0.0), largest[1])
     return {name: float(np.max(error[name] / np.where(scale[name] > 0, scale[name], 1.0), initial=0.0)) for name in error}
@@ -74,10 +74,10 @@ def differences(program: Callable[[Arrays], Arrays], signature: dict, record: st
 
 def refuses_other_dtypes(program: Callable[[Arrays], Arrays], signature: dict) -> bool:
     """Return whether the first input is refused in double or single precision, whichever is not its own."""
-    first, *others = [np.zeros((2, *port["shape"]), port["dtype"]) for port in signature["inputs"]]
+    first, *rest = [np.zeros((2, *port["shape"]), port["dtype"]) for port in signature["inputs"]]
     wrong = first.astype(np.float32 if first.dtype == np.float64 else np.float64)
     try:
-        program([wrong, *others])
+        program([wrong, *rest])
     except Exception:  # each runtime raises its own
         return True
     return False
