@@ -60,7 +60,7 @@ def with_grad(request):
         yield request.param
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("seed", "with_grad"), [(0, True), (1, False), (2, False)], indirect=["with_grad"])
 def test_each_environment_is_as_if_it_were_alone(touch, seed, with_grad):
     """A batch of which some are read equals modules of one environment each, which are called only when theirs is read."""
     alone = [copy.deepcopy(touch).seed(7, first_env=env) for env in range(NUM_ENVS)]

@@ -1,16 +1,17 @@
 """What is hard for temperatures: any step, conductivity and area; resets with a lag; links that are turned; energy."""
 
 import itertools
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 import torch
 
 from oracles.hard import case
-from oracles.setups.boxes import heat_module, heat_state, heated
+from oracles.setups.boxes import begin, heat_module, heat_state
 from oracles.setups.scenes import compiled, folder, temporary
 from tgdsl.fields.materials import MATERIALS
+from tgdsl.module.module import TactileModule
 
 STEPS = (1e-4, 0.01, 1.0, 10.0)
 """Seconds between calls."""
@@ -20,8 +21,11 @@ GRID = list(itertools.product(STEPS, (0.1, 400.0), (1e-9, 1e-5, 1e-2)))
 hard = partial(case.hard, "heat")
 
 
-def _beyond(dt: float, k: float, area: float, dtype: torch.dtype, rng: np.random.Generator) -> float:
-    """Return how far beyond −20 to 80 °C temperatures go of a link and three objects that are within [K]."""
+OBJECTS = ("hot", "cold", "plate")
+
+
+@cache
+def _with_three_objects(k: float, area: float, dtype: torch.dtype) -> TactileModule:
     objects: dict[str, Any] = {
         "hot": ([0.03] * 3, {"material": {"like": "copper", "conductivity": k}, "temperature": 80.0}),
         "cold": ([0.01] * 3, {"material": "rubber", "temperature": -20.0, "cells": [2, 2, 2]}),
@@ -31,10 +35,19 @@ def _beyond(dt: float, k: float, area: float, dtype: torch.dtype, rng: np.random
         "cells": [2, 3, 2], "material": {"like": "steel", "conductivity": k}, "contact_area": area, "convection": 50.0,
         "emissivity": 0.9,
     }  # fmt: skip
-    pairs = zip(objects, np.eye(3), strict=True)
+    return temporary(heat_module, {"tip": [0.01, 0.012, 0.008]}, sensor, objects, dtype)
+
+
+def _beyond(dt: float, k: float, area: float, dtype: torch.dtype, rng: np.random.Generator) -> float:
+    """Return how far beyond −20 to 80 °C temperatures go of a link and three objects that are within [K]."""
+    pairs = zip(OBJECTS, np.eye(3), strict=True)
     contacts = {("tip", name): [(tuple(rng.uniform(-5e-3, 5e-3, 3)), tuple(n), 1.0)] for name, n in pairs}
-    worst = 0.0
-    for readings in heated({"tip": [0.01, 0.012, 0.008]}, sensor, dt, 4, objects, contacts, dtype=dtype):
+    module, worst = _with_three_objects(k, area, dtype), 0.0
+    module.reset()
+    state = heat_state(module, dt, contacts)
+    begin(module, state)
+    for _ in range(4):
+        readings = module(state)
         every = torch.cat([readings["heat"][0, :, 0], readings["heat/objects"][0, :, 0]]).double()
         worst = max(worst, float(-20.0 - every.min()), float(every.max() - 80.0))
         worst = worst if torch.isfinite(every).all() else np.inf

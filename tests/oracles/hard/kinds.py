@@ -16,7 +16,7 @@ from tgdsl.quantities.contacts import SLOT_FIELDS
 from tgdsl.sensors import KINDS
 
 NAMES = tuple(kind.name for kind in KINDS)
-NUM_ENVS, NUM_CALLS = 4, 4
+NUM_ENVS, NUM_CALLS = 4, 3
 FLOAT32, FLOAT64, FAR = 1e-5, 1e-11, 1e-9
 """Largest error over the largest magnitude of the channel: 80 roundings of float32; rounding; 1 km away."""
 READ_BY = {"contact_audio": ("contact_force",), "actuation_audio": ("joint_vel",)}
