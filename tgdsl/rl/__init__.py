@@ -1,1 +1,1 @@
-"""Reinforcement learning on touch: environments, tasks, actuators and what is random about them."""
+"""Reinforcement learning on touch: environments, tasks, actuators and domain randomisation."""

@@ -1,32 +1,32 @@
-"""Actuators of a policy: from an action to torques, with what real drives do that ideal ones do not.
+"""Actuators of a policy: from an action to torques, with the imperfections of real drives.
 
 An action a ∈ [−1, 1] per joint becomes a target once per control step; before each physics step (time t, position q, speed q̇)
-the drive makes a torque of it:
+the drive turns it into a torque:
 
     absolute    w = q_low + (a + 1)/2 (q_high − q_low)
-    relative    w = clip(w' + s a, q_low, q_high)                  w' the target before, s the action's scale [rad, m]
-    offset      w = clip(w_0 + s a, q_low, q_high)                 w_0 the target with which the episode began
+    relative    w = clip(w' + s a, q_low, q_high)                  w' the previous target, s the action's scale [rad, m]
+    offset      w = clip(w_0 + s a, q_low, q_high)                 w_0 the target at the start of the episode
     smoothed    w ← (1 − σ) w + σ w'
     delayed     w of `delay` control steps ago
-    play        u = clip(u', w + b − β/2, w + b + β/2)             u' before, b position bias, β backlash [rad]
+    play        u = clip(u', w + b − β/2, w + b + β/2)             u' the previous u, b position bias, β backlash [rad]
     deadband    e = sign(u − q) max(|u − q| − δ, 0)
     drive       τ = clip(g_p k_p e − g_d k_d q̇, ± S τ_max)
     breakaway   τ ← κ τ  where |q̇| < `BREAKAWAY_SPEED`
     speed       |τ| ≤ τ_max max(0, 1 − |q̇|/q̇_max)  where τ q̇ > 0    (only with a `top_speed`)
-    noise       τ ← clip(τ + ν τ_max U(−1, 1), ± S τ_max)          neither a kick nor noise is beyond the drive's strength
+    noise       τ ← clip(τ + ν τ_max U(−1, 1), ± S τ_max)          kick and noise stay within the drive's strength
 
-k_p, k_d and τ_max are those of the robot's position actuators. MuJoCo's own actuator is given the control q + e, and what τ
-differs from its torque is a force on the joint: so what is neither drawn nor chosen costs nothing and stays implicit in
-MuJoCo's integrator. Factors g, S, κ and b, δ, β and the delay are drawn for each joint and environment at reset; noise at each
-physics step. A robot whose joint damping is τ_max over its rated speed, as the XHand1's is, has the line of `top_speed`
-already.
+k_p, k_d and τ_max come from the robot's position actuators. MuJoCo's own actuator gets the control q + e; the difference
+between τ and its torque is applied as a joint force. Ideal drives therefore cost nothing and stay implicit in MuJoCo's
+integrator. The factors g, S, κ, the offsets b, δ, β and the delay are drawn for each joint and environment at reset; noise at
+each physics step. A robot such as the XHand1, with joint damping τ_max over its rated speed, already has the line of
+`top_speed`.
 
 Source of gains, strength, bias, deadband, backlash, kick and noise: Chung et al., *Tactile Genesis*, appendix, "Domain
-Randomization". There the bias is printed in metres, and neither deadband, backlash nor kick are defined: the above is ours.
-Delay and top speed are ours.
+Randomization". The paper prints the bias in metres and does not define deadband, backlash and kick: the definitions above are
+ours, and so are delay and top speed.
 
-Joints are hinges, and slides with m for rad and N for N·m. Angles that a document gives (b, δ, β, a `top_speed`) are of hinges
-alone: slides have none, and a scale of their own.
+Joints are hinges, or slides with m for rad and N for N·m. A document's angles (b, δ, β, a `top_speed`) apply to hinges alone;
+slides have a separate scale.
 
 Shapes: `env` environments, `joint` actuated joints.
 """
@@ -62,37 +62,37 @@ Scale = Annotated[
 
 
 class ActionSpec(SpecModel):
-    """How an action of a policy is understood."""
+    """Meaning of a policy's action."""
 
     mode: Literal["relative", "absolute", "offset"] = "relative"
-    """Whether an action moves the target, is the target, −1 and 1 being the ends of the joint's range, or is how far the target
-    is from that at the episode's start."""
+    """Whether an action is a change of the target, the target itself (−1 and 1: the ends of the joint's range), or the
+    target's offset from its value at the episode's start."""
     scale: Scale = 0.05
-    """s, what an action of 1 is for a hinge's target [rad]: in a control step if relative, in all if `offset`. `half_range`:
-    half of each joint's range, of slides too."""
+    """s, the target's motion for an action of 1 on a hinge [rad]: per control step if `relative`, in total if `offset`.
+    `half_range`: half of each joint's range, slides included."""
     slide_scale: PositiveLength = 0.01
-    """The same of slides [m]."""
+    """s for slides [m]."""
     smoothing: Annotated[float, Quantity("number", ge=0.0)] = 0.0
-    """σ, share of the target before in the new one, less than 1."""
+    """σ, share of the previous target in the new one, less than 1."""
 
     @model_validator(mode="after")
     def _check(self) -> ActionSpec:
         for name, unit in (("scale", "rad"), ("slide_scale", "m")):
             value = getattr(self, name)
             if self.mode == "absolute" and value != type(self).model_fields[name].default:
-                shown = value if isinstance(value, str) else f"{value:g} {unit}"
-                problem = f"{name} is {shown}, but absolute actions have none: their ends are those of the joint's range"
+                text = value if isinstance(value, str) else f"{value:g} {unit}"
+                problem = f"{name} is {text}, but absolute actions have none: they span the joint's range"
                 raise ValueError(f"{problem}; leave it out, or take mode relative or offset")
         if self.smoothing >= 1.0:
             raise ValueError(f"smoothing is {self.smoothing:g}, expected less than 1: targets would never move")
         return self
 
 
-MOST_DELAY = 1000  # longest delay of a target [control steps]: of each environment so many targets are kept
+MOST_DELAY = 1000  # longest delay of a target [control steps]; each environment stores this many targets
 
 
 class DriveSpec(SpecModel):
-    """What drives do that ideal ones do not. All may be ranges, drawn for each joint and environment at reset."""
+    """Imperfections of drives. All may be ranges, drawn for each joint and environment at reset."""
 
     gain: Factor = ONE
     """g_p, factor on the proportional gain."""
@@ -101,7 +101,7 @@ class DriveSpec(SpecModel):
     strength: Factor = ONE
     """S, factor on the largest torque."""
     bias: Annotated[Range, RangeOf("angle")] = ZERO
-    """b, what is added to a position target [rad]."""
+    """b, offset of a position target [rad]."""
     deadband: Annotated[Range, RangeOf("angle", ge=0.0)] = ZERO
     """δ, position error without torque [rad]."""
     backlash: Annotated[Range, RangeOf("angle", ge=0.0)] = ZERO
@@ -113,7 +113,7 @@ class DriveSpec(SpecModel):
     delay: Annotated[Range, RangeOf("number", ge=0.0)] = ZERO
     """How many control steps late a target arrives; whole numbers, both ends included."""
     top_speed: Annotated[float, Quantity("number", gt=0.0)] | Literal["robot"] | None = None
-    """q̇_max, speed at which the largest torque that drives on has fallen to zero [rad/s]; `robot`: τ_max over joint damping."""
+    """q̇_max, speed at which the largest accelerating torque reaches zero [rad/s]; `robot`: τ_max over joint damping."""
 
     @model_validator(mode="after")
     def _check(self) -> DriveSpec:
@@ -188,12 +188,12 @@ def _actuator_row(model: mujoco.MjModel, name: str) -> tuple[int | float, ...]:
 
 
 class Actuation:
-    """The drives of all environments: their targets, what was drawn for each, and their torques."""
+    """The drives of all environments: their targets, drawn parameters and torques."""
 
     target: Float[Tensor, "env joint"]  # position targets after the last action [rad]
-    start: Float[Tensor, "env joint"]  # those that episodes began with [rad]
+    start: Float[Tensor, "env joint"]  # position targets at the start of the episodes [rad]
     torque: Float[Tensor, "env joint"]  # what each drive exerted in the last physics step [N·m]
-    drawn: Mapping[str, Float[Tensor, "env joint"]]  # what was drawn for each drive, by the names of `DriveSpec`
+    drawn: Mapping[str, Float[Tensor, "env joint"]]  # each drive's parameters, by field of `DriveSpec`
 
     def __init__(
         self,
@@ -210,7 +210,7 @@ class Actuation:
         device, dtype, num_envs, num = qpos.device, qpos.dtype, len(qpos), len(actuators.names)
         unlimited = [name for name, limit in zip(actuators.names, actuators.limit, strict=True) if not np.isfinite(limit)]
         if unlimited and (drive.torque_noise or drive.top_speed or drive.strength != ONE):
-            raise SimulationError(f"joints {listed(unlimited)} have no largest torque, of which this drive's is a share")
+            raise SimulationError(f"joints {listed(unlimited)} have no largest torque, which this drive's options scale")
         if "scale" in action.model_fields_set and not isinstance(action.scale, str) and actuators.is_slide.all():
             problem = f"action.scale is {action.scale:g} rad, but the policy moves slides alone: {listed(actuators.names)}"
             raise SimulationError(f"{problem}; expected action.slide_scale [m]")
@@ -227,8 +227,8 @@ class Actuation:
         self.drawn = {name: torch.full(shape, getattr(ideal, name)[0], device=device, dtype=dtype) for name in _DRAWN}
         self._random = tuple(name for name in _DRAWN if getattr(drive, name) != getattr(ideal, name))
         self._drawn = torch.zeros((len(self._random), *shape), device=device, dtype=dtype)
-        for name, own in zip(self._random, self._drawn, strict=True):
-            self.drawn[name] = own.copy_(self.drawn[name])
+        for name, values_of in zip(self._random, self._drawn, strict=True):
+            self.drawn[name] = values_of.copy_(self.drawn[name])
         low, high = (self._ends(i) for i in (0, 1))
         self._low, self._span = low.float().to(device), (high - low).float().to(device)
         self._past = torch.zeros((int(drive.delay[1]) + 1, num_envs, num), device=device, dtype=dtype)
@@ -253,12 +253,12 @@ class Actuation:
             put(self._drawn, chosen[:, None], new.to(self._drawn.dtype).transpose(0, 1))
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"], at_controls: bool = False) -> None:
-        """Have the drives of some environments begin again: see `place`."""
+        """Restart the drives of some environments: see `place`."""
         put(self._count, chosen, episode << 32)
         self.place(chosen, at_controls)
 
     def place(self, chosen: Bool[Tensor, " env"], at_controls: bool = False) -> None:
-        """Have the drives of some environments hold the positions that their joints now have, or the present controls."""
+        """Set the targets of some environments to their joints' present positions, or to the present controls."""
         name, which = ("ctrl", "actuator") if at_controls else ("qpos", "qpos")
         now, mask = self._arrays[name].index_select(1, self._index[which]), chosen[:, None]
         for held in (self.target, self._past, self.start):
@@ -267,9 +267,9 @@ class Actuation:
         put(self.torque, mask, 0.0)
 
     def command(self, action: Float[Tensor, "env joint"]) -> None:
-        """Take an action of each environment: new targets, of which the drives know once they arrive.
+        """Set new targets from an action of each environment; the drives see them after the delay.
 
-        What is beyond −1 and 1 is clipped; where an action is no number, its target stays.
+        Actions are clipped to [−1, 1]; a non-finite action leaves its target unchanged.
         """
         self._take(self.commanded(action))
 
@@ -285,26 +285,26 @@ class Actuation:
         return torch.where(action.isfinite(), command, self.target)
 
     def follow(self, control: Float[Tensor, "env actuator"]) -> None:
-        """Take set-points that come from elsewhere, such as a hand's line, in place of actions; those of other joints too."""
+        """Set targets from external set-points of all actuators, such as a hand's serial line, instead of actions."""
         self._arrays["ctrl"].copy_(control)
         self._take(control.index_select(1, self._index["actuator"]).to(self.target))
 
     def _take(self, target: Float[Tensor, "env joint"]) -> None:
-        """Take new targets, of which the drives know once they arrive."""
+        """Set new targets; the drives see them after the delay."""
         self.target.copy_(target)
         self._past.copy_(torch.cat([self.target[None], self._past[:-1]]))
         if self.is_ideal:
             self._arrays["ctrl"][:, self._index["actuator"]] = self._arrived()
 
     def drive(self) -> None:
-        """Make a torque of each target, before a physics step: see the top of this page."""
+        """Compute the drives' torques before a physics step: see the module's equations."""
         arrays, values, drawn = self._arrays, self._values, self.drawn
         pos, speed = (arrays[name].index_select(1, self._index[which]) for name, which in (("qpos", "qpos"), ("qvel", "dof")))
         delayed, half = self._arrived() + drawn["bias"], 0.5 * drawn["backlash"]
         self._play.copy_(torch.minimum(torch.maximum(self._play, delayed - half), delayed + half))
         error = self._play - pos
         error = error.sign() * (error.abs() - drawn["deadband"]).clamp(min=0.0)
-        # MuJoCo clips controls to the joint's range: what is beyond it is part of the force on the joint.
+        # MuJoCo clips controls to the joint's range: the excess is part of the joint force.
         control = torch.minimum(torch.maximum(pos + error, values["low"]), values["high"])
         plain = _within(values["stiffness"] * (control - pos) - values["damping"] * speed, values["limit"])
         torque = drawn["gain"] * values["stiffness"] * error - drawn["damping"] * values["damping"] * speed
@@ -324,13 +324,13 @@ class Actuation:
         arrays["qfrc_applied"][:, self._index["dof"]] = torque - plain
 
     def memory(self) -> dict[str, Tensor]:
-        """Return its state by name: live tensors, (env, joint) each but for delayed targets and the count."""
+        """Return its state by name: live tensors (env, joint); `past` is (step, env, joint), `count` (env,)."""
         memory = {"target": self.target, "start": self.start, "torque": self.torque}
         memory |= {"play": self._play, "past": self._past, "count": self._count}
         return memory | {f"drawn/{name}": value for name, value in self.drawn.items()}
 
     def _ends(self, which: int) -> Float[Tensor, "drawn joint"]:
-        """Return the lower or upper ends of what is drawn; of delays, which are rounded down, that of the last one's share."""
+        """Return the lower or upper bounds of the drawn parameters; a delay, rounded down, has an upper bound one higher."""
         ends = torch.zeros((len(self._random), len(self._is_slide)), dtype=torch.float64)
         for name, bounds in zip(self._random, ends, strict=True):
             bounds += getattr(self.spec, name)[which] + (which if name == "delay" else 0)
@@ -345,8 +345,8 @@ class Actuation:
 
 
 _DRAWN = ("gain", "damping", "strength", "bias", "deadband", "backlash", "kick", "delay")
-"""What is drawn for each drive; whole numbers last."""
-_ANGLES = ("bias", "deadband", "backlash")  # those that are angles, and so of hinges alone
+"""Parameters drawn for each drive; whole numbers last."""
+_ANGLES = ("bias", "deadband", "backlash")  # angles, which slides do not have
 
 
 def _within(value: Tensor, limit: Tensor) -> Tensor:

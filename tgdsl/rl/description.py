@@ -53,16 +53,16 @@ def describe(
     """Return the features of each group of observations."""
     setup, substeps = task.setup, loaded.spec.physics.substeps if loaded.spec.temporal == "stack" else 0
     names, is_slide = setup.actuators.names, setup.actuators.is_slide.tolist()
-    known: dict[str, Sequence[Features]] = {
+    by_group: dict[str, Sequence[Features]] = {
         "proprio": _joints(names, is_slide, loaded.spec.proprio.vel_scale),
         "priv_proprio": [*_joints(names, is_slide, 1.0), *link_forces(setup.links)],
     }
-    known |= {name: _touch(sensed, source, substeps) for name, source in sensed.groups.items()} | dict(task.describe())
-    known |= {name: term.describe(setup) for name, term in terms.items() if isinstance(term, ObservationTerm)}
+    by_group |= {name: _touch(sensed, source, substeps) for name, source in sensed.groups.items()} | dict(task.describe())
+    by_group |= {name: term.describe(setup) for name, term in terms.items() if isinstance(term, ObservationTerm)}
     result, notes = {}, _notes(loaded)
     for group, size in sizes.items():
         features = [
-            replace(each, note=notes.get(each.sensor, "")) for each in known.get(group) or [Features("not described", size)]
+            replace(each, note=notes.get(each.sensor, "")) for each in by_group.get(group) or [Features("not described", size)]
         ]
         stops = np.cumsum([each.size for each in features]).tolist()
         result[group] = tuple((slice(stop - each.size, stop), each) for stop, each in zip(stops, features, strict=True))

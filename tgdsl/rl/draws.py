@@ -1,9 +1,9 @@
-"""Random quantities of environments, counted and not drawn: each is a hash of what it is for.
+"""Counter-based random numbers of environments: each is a hash of its purpose and counters.
 
-A number depends on the seed, on what it is for, on its environment, counted over all processes, and on a count of that
-environment's own, such as its episode. So it is the same on every device, in any batch, and whatever else is random.
+A number depends on the seed, its purpose, the environment's index across all processes, and a counter of that environment,
+such as its episode. It is the same on every device, in any batch, and independent of all other random numbers.
 
-The words are those of the sensors' noise: see `tgdsl.sensors.noise.random`.
+The hash is the one of the sensors' noise: see `tgdsl.sensors.noise.random`.
 
 Shapes: `env` environments, `num` numbers of one environment.
 """
@@ -26,7 +26,7 @@ from tgdsl.tensors.fused import FusedCall
 
 
 class _Streams(NamedTuple):
-    """What the numbers of some purposes begin from: of each purpose a hash with its environments, of each number its place."""
+    """Keys of several purposes' numbers: a hash per environment and purpose; each number's purpose and index in it."""
 
     begun: Int[Tensor, "env purpose half"]
     purpose: Int[Tensor, " num"]
@@ -34,7 +34,7 @@ class _Streams(NamedTuple):
 
 
 class _Prefetched(NamedTuple):
-    """Shares that were made ahead: the counter at which the first of them is due, and those that are left."""
+    """Numbers hashed ahead of time: the counter of the first one left, and the numbers left."""
 
     counter: Int[Tensor, " env"]
     left: list[Float[Tensor, "env num"]]
@@ -56,7 +56,7 @@ class Draws:
         self._shares = FusedCall(self._share, is_compiled, has_fixed_shapes=False)
 
     def reseed(self, seed: int) -> None:
-        """Choose another seed, in place: graphs that were captured draw its numbers."""
+        """Change the seed in place: captured graphs draw its numbers too."""
         self.seed = _checked(seed)
         self._ahead.clear()
         for sizes, streams in self._known.items():
@@ -71,7 +71,7 @@ class Draws:
     def side_by_side(
         self, sizes: Mapping[str, int], counter: Int[Tensor, " env"], chosen: Bool[Tensor, " env"] | None = None
     ) -> Float[Tensor, "env num"]:
-        """Return numbers between 0 and 1 for several purposes in turn, of the few operations that one of them takes."""
+        """Return numbers between 0 and 1 for several purposes, concatenated, with as few operations as for one."""
         streams = self._streams(sizes)
         if not self._is_on_host:
             return self._shares(*streams, counter)
@@ -84,9 +84,9 @@ class Draws:
         return torch.from_numpy(result)
 
     def shares_ahead(self, what: str, counter: Int[Tensor, " env"], num: int, ahead: int) -> Float[Tensor, "env num"]:
-        """Return `shares` for a purpose that is asked for again and again, its counter one higher each time.
+        """Return `shares` for a purpose whose counter rises by one with each call.
 
-        On a host those of so many counts are hashed at once, and handed out as long as the counter is what they were made for.
+        On a CPU the numbers of `ahead` counts are hashed at once, and hashed again where the counter does not match.
         """
         if not self._is_on_host:
             return self.shares({what: num}, counter)[what]
@@ -116,7 +116,7 @@ class Draws:
         return whole(self.shares({what: num}, counter)[what], low, high)
 
     def _streams(self, sizes: Mapping[str, int]) -> _Streams:
-        """Return what the numbers of some purposes begin from."""
+        """Return the keys of some purposes' numbers."""
         requests = tuple(sizes.items())
         if requests not in self._known:  # at the first call: a graph that is captured later copies nothing from the host
             purpose = torch.tensor([i for i, (_, num) in enumerate(requests) for _ in range(num)], device=self._device)

@@ -51,7 +51,7 @@ Observations = dict[str, Float[Tensor, "env feature"]]
 
 
 class StepInfo(NamedTuple):
-    """Further results of a step. Where an episode has ended, its values are given, not those of the next one."""
+    """Further results of a step. Where an episode has ended, values are of that episode, not of the next one."""
 
     ended: Bool[Tensor, " env"]  #: episodes that have ended, terminated or truncated
     final_obs: Observations  #: observations before the reset: they differ from `Step.obs` where an episode has ended
@@ -138,7 +138,7 @@ class TouchEnv:
             first_env: Index of the first environment across all processes, for random numbers and variants.
             feels: Touch of several policies, each an observation group `Felt.group`. They replace the document's `touch`,
                 `placement` and `noise`, and the group `tactile_sensors`.
-            sensed: The result of `compile_sensed`, in place of the document's sensors; its module is not copied.
+            sensed: The result of `compile_sensed`, to use instead of the document's sensors; its module is not copied.
             progress: Function that takes a line of text about each long job.
 
         Raises:
@@ -194,13 +194,13 @@ class TouchEnv:
         )
         self._has_stepped, tell = True, progress or silent
         if is_cuda or is_compiled:
-            tell(f"compiling kernels of {'physics and touch' if is_cuda else 'touch'}, which are kept for the next run")
+            tell(f"compiling kernels of {'physics and touch' if is_cuda else 'touch'}, which are cached for the next run")
         obs = self.reset(seed)
         self._terms = tuple(self._rates(self.now, torch.zeros_like(self.sim.faults)))
         self._sums = self._return.new_zeros((len(self._terms), num_envs))
         self.groups = {name: value.shape[1] for name, value in obs.items()}
-        own = type(self.task).own_groups
-        if own is not None and (other := set(own) ^ set(self.task.observe(self.now))):
+        groups_of_class = type(self.task).own_groups
+        if groups_of_class is not None and (other := set(groups_of_class) ^ set(self.task.observe(self.now))):
             raise SimulationError(f"{type(self.task).__name__}: `own_groups` and `observe` differ in {listed(sorted(other))}")
         if is_cuda or is_compiled:  # compile kernels and, on a GPU, capture the step
             for _ in range(PREPARING_STEPS):
@@ -216,7 +216,7 @@ class TouchEnv:
             SimulationError: If a state was loaded: there is none until the next step.
         """
         if self._instant is None:
-            raise SimulationError("a state was loaded: what was read then is there again after the next step")
+            raise SimulationError("a state was loaded: its readings are available after the next step")
         return self._instant
 
     def reset(self, seed: int | None = None) -> Observations:
@@ -279,7 +279,7 @@ class TouchEnv:
         return describe(self.loaded, self._sensed, self.task, self.curricula.terms, self.groups)
 
     def follow(self, control: Float[Tensor, "env nu"]) -> Step:
-        """Make one control step towards external set-points, such as those of a hand's serial line, without a policy.
+        """Make one control step towards external set-points, such as a hand's serial line reports, without a policy.
 
         Actions count as zeros. Ended episodes do not restart: call `reset`.
 
@@ -318,8 +318,8 @@ class TouchEnv:
         Raises:
             SimulationError: If the state is from other environments; nothing is changed then.
         """
-        own = self._memory() | {"touch": self.touch.state_dict(), "obs": self._obs, "seed": {"seed": torch.tensor(0)}}
-        _refuse_other(own, {part: saved for part, saved in state.items() if part != "sim"})
+        expected = self._memory() | {"touch": self.touch.state_dict(), "obs": self._obs, "seed": {"seed": torch.tensor(0)}}
+        _refuse_other(expected, {part: saved for part, saved in state.items() if part != "sim"})
         self.sim.load_state_dict(state.get("sim", {}))  # refuses another one's before it changes
         with torch.no_grad():
             for part, memory in self._memory().items():
@@ -411,7 +411,7 @@ class TouchEnv:
         return torch.where(is_bad[:, None], torch.nan, ctrl)
 
     def _judge(self, now: Now, faults: Bool[Tensor, " env"]) -> Step:
-        """Return ends, rewards and observations of a control step before any reset, and add rewards up."""
+        """Return ends, rewards and observations of a control step before any reset, and accumulate rewards."""
         task, num = type(self.task).__name__, self.num_envs
         terminated = checked(f"{task}: `is_over`", self.task.is_over(now), num, dtype=torch.bool) | faults
         rates = self._rates(now, terminated)
@@ -436,7 +436,7 @@ class TouchEnv:
         return Step(obs, reward, terminated, truncated, info)
 
     def _rates(self, now: Now, terminated: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
-        """Return the terms of the reward as rates, those of the document among them [1/s]."""
+        """Return the terms of the reward as rates, including the document's terms [1/s]."""
         task = type(self.task).__name__
         rates = {
             name: checked(f'{task}: the term "{name}" of `reward`', value, self.num_envs)
@@ -492,11 +492,11 @@ class TouchEnv:
         return {name: value.to(self.device, torch.float32) for name, value in result.items()}
 
 
-def _refuse_other(own: Mapping[str, Mapping[str, Tensor]], given: Mapping[str, Mapping[str, Tensor]]) -> None:
-    """Raise `SimulationError` if parts, or names or shapes in one, differ from what was saved."""
+def _refuse_other(current: Mapping[str, Mapping[str, Tensor]], other: Mapping[str, Mapping[str, Tensor]]) -> None:
+    """Raise `SimulationError` if parts, names or shapes differ from the saved state."""
     expected, saved = (
         {f"{part} {name}": value.shape for part, tensors in state.items() for name, value in tensors.items()}
-        for state in (own, given)
+        for state in (current, other)
     )
     if wrong := [name for name in {**expected, **saved} if expected.get(name) != saved.get(name)]:
         problem = f"{listed(wrong)} missing, not known or of another shape"
@@ -504,7 +504,7 @@ def _refuse_other(own: Mapping[str, Mapping[str, Tensor]], given: Mapping[str, M
 
 
 def _copied(value: Any) -> Any:
-    """Return copies of all tensors in dictionaries and named tuples: a graph's own are overwritten at its next replay."""
+    """Return copies of all tensors in dictionaries and named tuples: a graph overwrites its outputs at the next replay."""
     if isinstance(value, Tensor):
         return value.clone()
     if isinstance(value, Mapping):

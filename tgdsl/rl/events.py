@@ -1,4 +1,4 @@
-"""Events of all environments: those of `randomise`, and those that a document adds under `terms`.
+"""Events of all environments: from `randomise`, and from a document's `terms`.
 
 Shapes: `env` environments.
 """
@@ -49,7 +49,7 @@ class Events:
     """
 
     def __init__(self, terms: Mapping[str, EventTerm], sim: Simulation, setup: Setup, actuation: Actuation):
-        """Make the counters of events at intervals; each reset draws when the first ones come."""
+        """Make the counters of interval events; each reset draws the time of the first ones."""
         self._terms, self._setup, self.memory = terms, setup, dict[str, Tensor]()
         self._event = partial(Event, sim, setup, actuation)
         for name, term in terms.items():
@@ -63,7 +63,7 @@ class Events:
                 self.memory[f"{name}/{kind}"] = torch.zeros(setup.num_envs, dtype=torch.int64, device=setup.device)
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"], is_placed: bool) -> None:
-        """Have events at a reset happen, end those that last, and draw when the others come first."""
+        """Apply reset events, end the running interval events, and draw when they happen next."""
         for name, term in self._terms.items():
             if term.mode == "reset":
                 if term.changes_model != is_placed:
@@ -88,7 +88,7 @@ class Events:
                 self._wait(name, term, ends)
 
     def _wait(self, name: str, term: EventTerm, chosen: Bool[Tensor, " env"]) -> None:
-        """Draw how many control steps there are before the next one."""
+        """Draw the number of control steps until the next event."""
         first, last = (round(end / self._setup.control_step) for end in term.interval)
         purpose = f"{name} interval"
         share = self._setup.draws.shares({purpose: 1}, self.memory[f"{name}/count"], chosen)[purpose]
@@ -99,9 +99,9 @@ M = TypeVar("M", bound=SpecModel)
 
 
 class Curricula:
-    """The curricula of a task's document: `values` of the numbers that they change, by dotted path, tensors without axes.
+    """The curricula of a task's document: `values` of the numbers that they change, by dotted path, scalar tensors.
 
-    `spec` is the document and `terms` are those that it adds, with these tensors in place of its own numbers.
+    `spec` and `terms` are the document's, with these tensors instead of the numbers.
     """
 
     def __init__(self, loaded: LoadedTask, like: Tensor):
@@ -125,7 +125,7 @@ def _below(start: str, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _with(model: M, values: Mapping[str, Tensor]) -> M:
-    """Return a model with other values by dotted path, which are not checked."""
+    """Return a model with other values by dotted path, without validation."""
     update: dict[str, Any] = {path: value for path, value in values.items() if "." not in path}
     for name in {path.partition(".")[0] for path in values} - update.keys():
         update[name] = _with(getattr(model, name), _below(name, values))

@@ -1,4 +1,4 @@
-"""Groups of observations that tasks share: parts of them, each with its numbers and what they are.
+"""Parts of observation groups that tasks share, each with its numbers and their description.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "Observation groups".
 

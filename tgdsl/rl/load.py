@@ -90,7 +90,7 @@ def load_task(document: str | PathLike[str] | Mapping[str, Any], overrides: Mapp
 
 
 def _terms(source: Source, folder: Path, task: type[Task[Any]], spec: TaskSpec, problems: list[Problem]) -> dict[str, Term]:
-    """Return the terms that a document adds; note what is wrong with them."""
+    """Return the terms that a document adds; append their mistakes to `problems`."""
     terms, known_terms = {}, TERMS.by_name()
     for name, value in spec.terms.items():
         place = ("terms", name)
@@ -149,9 +149,9 @@ def wrong_groups(
 
 def number_owners(task: type[Task[Any]], spec: TaskSpec, terms: Mapping[str, Term]) -> dict[str, SpecModel]:
     """Return the models of the numbers that a curriculum may change, by dotted path: of the task and of the terms."""
-    own = [name for name in type(spec).model_fields if name not in (*TaskSpec.model_fields, *task.constants)]
-    owners: dict[str, SpecModel] = {name: spec for name in own if isinstance(getattr(spec, name), float)}
-    models = {name: getattr(spec, name) for name in own}
+    keys = [name for name in type(spec).model_fields if name not in (*TaskSpec.model_fields, *task.constants)]
+    owners: dict[str, SpecModel] = {name: spec for name in keys if isinstance(getattr(spec, name), float)}
+    models = {name: getattr(spec, name) for name in keys}
     models |= {f"terms.{name}": term for name, term in terms.items() if not isinstance(term, CurriculumTerm)}
     for path, model in models.items():
         constants = model.constants if isinstance(model, Term) else ()
@@ -209,7 +209,7 @@ def _user_module(name: str, folder: Path) -> Any:
         raise FileNotFoundError("there is no such file")
     module = importlib.util.module_from_spec(module_spec)
     sys.modules[module_name] = module
-    sys.path.insert(0, str(file.parent))  # modules beside it, as where Python runs the file
+    sys.path.insert(0, str(file.parent))  # modules in the same folder, as when Python runs the file
     try:
         module_spec.loader.exec_module(module)
     except BaseException:
@@ -221,7 +221,7 @@ def _user_module(name: str, folder: Path) -> Any:
 
 
 def task_schema() -> dict[str, Any]:
-    """Return the schema of all tasks of tgdsl by name; of one's own task it knows what all tasks have in common."""
+    """Return the schema of all tasks of tgdsl by name; a user's task has the keys that all tasks share."""
     specs: dict[str, type[TaskSpec]] = {
         name: getattr(import_module(place), class_).Spec for name, (place, class_) in TASKS.items()
     }
@@ -229,10 +229,10 @@ def task_schema() -> dict[str, Any]:
     for model in (TaskSpec, *dict.fromkeys(specs.values())):
         schema = model.model_json_schema(ref_template="#/$defs/{model}")
         parts = schema.pop("$defs", {})
-        others = {name: f"{model.__name__}.{name}" for name, part in parts.items() if definitions.get(name, part) != part}
-        definitions |= _renamed({others.get(name, name): part for name, part in parts.items()}, others)
+        new_names = {name: f"{model.__name__}.{name}" for name, part in parts.items() if definitions.get(name, part) != part}
+        definitions |= _renamed({new_names.get(name, name): part for name, part in parts.items()}, new_names)
         schema.pop("title", None)
-        definitions[model.__name__] = _renamed(schema, others)
+        definitions[model.__name__] = _renamed(schema, new_names)
     task_spec = definitions["TaskSpec"]
     task_spec["additionalProperties"] = True
     description = task_spec["properties"]["randomise"]["description"]
@@ -252,13 +252,13 @@ def task_schema() -> dict[str, Any]:
     }
 
 
-def _renamed(schema: Any, others: Mapping[str, str]) -> Any:
+def _renamed(schema: Any, new_names: Mapping[str, str]) -> Any:
     if isinstance(schema, list):
-        return [_renamed(part, others) for part in schema]
+        return [_renamed(part, new_names) for part in schema]
     if not isinstance(schema, dict):
         return schema
-    result = {name: _renamed(part, others) for name, part in schema.items()}
+    result = {name: _renamed(part, new_names) for name, part in schema.items()}
     if isinstance(result.get("$ref"), str):
         folder, _, name = result["$ref"].rpartition("/")
-        result["$ref"] = f"{folder}/{others.get(name, name)}"
+        result["$ref"] = f"{folder}/{new_names.get(name, name)}"
     return result

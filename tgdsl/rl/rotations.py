@@ -27,16 +27,16 @@ def about(axis: Vector, angle: Float[Tensor, "*n"]) -> Quat:
 
 
 def between(one: Quat, other: Quat) -> Float[Tensor, "*n"]:
-    """Return by how much one rotation differs from another, from 0 to π [rad]: the angle θ of the turn between them.
+    """Return the angle θ of the rotation between two rotations, from 0 to π [rad].
 
-    Of unit length they are 2 |sin θ/4| and 2 |cos θ/4| apart, as q and −q are the same rotation.
+    Unit quaternions are 2 |sin θ/4| and 2 |cos θ/4| apart, as q and −q are the same rotation.
     """
     apart, against = (vector_norm(difference, dim=-1) for difference in (one - other, one + other))
     return 4.0 * torch.atan2(torch.minimum(apart, against), torch.maximum(apart, against))
 
 
 def twist(quat: Quat, axis: Vector) -> Float[Tensor, "*n"]:
-    """Return by how much a rotation turns about an axis, from −π to π [rad]: the twist of its swing-twist decomposition."""
+    """Return a rotation's angle about an axis, from −π to π [rad]: the twist of its swing-twist decomposition."""
     along = (quat[..., 1:] * axis).sum(dim=-1)
     return 2.0 * torch.atan2(along * torch.where(quat[..., 0] < 0, -1.0, 1.0), quat[..., 0].abs())
 
@@ -49,7 +49,7 @@ def swing(quat: Quat, axis: Vector) -> Float[Tensor, "*n"]:
 
 
 def six_numbers(quat: Quat) -> Float[Tensor, "*n 6"]:
-    """Return the first two columns of the rotation's matrix: orientation without a jump, as networks want it.
+    """Return the first two columns of the rotation's matrix, a continuous representation for networks.
 
     Source: Zhou et al., On the Continuity of Rotation Representations in Neural Networks, CVPR 2019.
     """

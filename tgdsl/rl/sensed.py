@@ -1,4 +1,4 @@
-"""The module of a task: of the sensors' document, those sensors alone that the policy feels or the task looks at.
+"""The module of a task: only the sensors that the policy or the task reads.
 
 Shapes: `env` environments, `step` physics steps of a control step, the first one first, `feature` numbers of a group.
 """
@@ -30,8 +30,8 @@ from tgdsl.schema.yaml import Path as Place
 from tgdsl.sensors.known import known_kinds
 from tgdsl.tuning.compile import compile as compile_document
 
-GROUP = "tactile_sensors"  # the observation group of what a policy feels
-CLEAN = "clean"  # the noise profile that has none
+GROUP = "tactile_sensors"  # the observation group of a policy's touch
+CLEAN = "clean"  # the noise profile without noise
 KEYS: dict[str, Place] = {
     "links": ("placement",),
     "noise": ("noise",),
@@ -39,11 +39,11 @@ KEYS: dict[str, Place] = {
     "robot": ("physics", "collision"),
     "objects": ("variants",),
 }
-"""A task's keys that set something in the sensors' document, by what they set there."""
+"""A task's keys that override the sensors' document, by the document's key."""
 
 
 class Felt(NamedTuple):
-    """What a policy feels: a `TouchType` except "none", a link group or name with shell wildcards, and a noise profile."""
+    """Touch of a policy: a `TouchType` except "none", a link group or name with shell wildcards, and a noise profile."""
 
     type: str
     placement: str
@@ -51,7 +51,7 @@ class Felt(NamedTuple):
 
     @property
     def group(self) -> str:
-        """Its group of observations, where policies feel several things in one simulation."""
+        """Its group of observations, where policies with different touch share a simulation."""
         return f"{GROUP}/{self.type}/{self.placement}/{self.noise}"
 
     @property
@@ -61,23 +61,23 @@ class Felt(NamedTuple):
 
     @property
     def is_per_link(self) -> bool:
-        """Whether it has numbers of links, not of taxels."""
+        """Whether its features are per link, not per taxel."""
         return issubclass(touch_types()[self.type][1], PerLink)
 
     @property
     def observation(self) -> str:
-        """The module's observation that the group is taken from."""
+        """The module's observation that contains the group."""
         return f"{GROUP}_{self.type}_{self.noise}"
 
 
 def _observation(type_: str, reading: str) -> OfReading:
-    """Return the observation of a reading that a word of `touch:` names."""
+    """Return the observation of a reading for a word of `touch:`."""
     model = touch_types()[type_][1]
     return model.model_validate({"type": get_args(model.model_fields["type"].annotation)[0], "of": reading})
 
 
 class Source(NamedTuple):
-    """Where a group comes from: the module's observation, which of its columns (None: all), and the taxels that they are of."""
+    """Source of a group: the module's observation, the columns in it (None: all), and their taxels."""
 
     observation: str
     spec: OfReading
@@ -87,16 +87,16 @@ class Source(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sensed:
-    """What a task's environments feel."""
+    """A task's sensors, and the names of their readings."""
 
     touch: TactileModule
-    felt: str | None  # name of the sensor that the policy feels; None if it feels nothing
+    felt: str | None  # name of the policy's sensor; None without touch
     contact: str | None  # name of the `link_contact` sensor; None if the task takes none
     channels: tuple[str, ...]  # its channels: the force is among them, and the normal force if the task wants it
     distance: str | None  # name of the `surface_distance` sensor; None if the task takes none
     object: str  # body of the task's object in the scene
     by_kind: Mapping[str, str]  # name of the sensor of each kind that the task looks at
-    groups: Mapping[str, Source]  # groups of observations of what is felt
+    groups: Mapping[str, Source]  # groups of touch observations
 
     def observe(self, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the groups of touch, in the units of their sensors."""
@@ -129,7 +129,7 @@ def compile_sensed(
     feels: Sequence[Felt] | None = None,
     also: Mapping[str, Sequence[Mapping[str, Any]]] | None = None,
 ) -> Sensed:
-    """Compile what a task's environments feel."""
+    """Compile a task's sensors."""
     spec, document = loaded.spec, sensors_document(loaded)
     senses = loaded.senses if only is None else only
     of_policy = [] if only is not None or spec.touch == "none" else [spec.touch]
@@ -185,13 +185,13 @@ def compile_sensed(
 
 
 def _overrides(loaded: LoadedTask, felts: Mapping[Felt, str]) -> tuple[dict[str, Any], dict[str, OfReading]]:
-    """Return what of the sensors' document is set for policies that feel several things, and the module's observations."""
+    """Return overrides of the sensors' document for policies with different touch, and the module's observations."""
     result, observations = dict[str, Any](), dict[str, OfReading]()
     for sensor in dict.fromkeys(felts.values()):
         carried = [felt for felt, carrier in felts.items() if carrier == sensor]
         noises = list(dict.fromkeys(felt.noise for felt in carried if felt.noise != CLEAN))
         if len(noises) > 1:
-            problem = f"noise {listed(noises)} of one sensor in one simulation, expected one beside {CLEAN}"
+            problem = f"noise {listed(noises)} of one sensor in one simulation, expected at most one and {CLEAN}"
             raise loaded.error(("noise",), problem)
         is_both = bool(noises) and any(felt.noise == CLEAN for felt in carried)
         result[f"sensors.{sensor}.links"] = list(dict.fromkeys(felt.placement for felt in carried))
@@ -204,7 +204,7 @@ def _overrides(loaded: LoadedTask, felts: Mapping[Felt, str]) -> tuple[dict[str,
 
 
 def _source(loaded: LoadedTask, touch: TactileModule, felt: Felt, spec: OfReading, layout: Layout) -> Source:
-    """Return where a group comes from: of the sensor's taxels or links those of the placement."""
+    """Return a group's source: the placement's taxels or links of the sensor."""
     links = [link.name for link in layout.links]
     names = layout.groups.get(felt.placement) or tuple(matching(felt.placement, links))
     if set(names) == set(links):
@@ -214,19 +214,19 @@ def _source(loaded: LoadedTask, touch: TactileModule, felt: Felt, spec: OfReadin
     rows = np.flatnonzero([name in names for name in links]) if felt.is_per_link else taxels
     num_rows = len(links) if felt.is_per_link else layout.num_taxels
     if not num_rows or size % num_rows:
-        problem = f'"{felt.type}" cannot be felt at {felt.placement} beside other links: its numbers are not of taxels'
+        problem = f'"{felt.type}" at {felt.placement} cannot share a sensor with other links: its numbers are not of taxels'
         raise loaded.error(("placement",), problem)
     columns = (np.arange(size // num_rows)[:, None] * num_rows + rows).ravel()
     return Source(felt.observation, spec, torch.from_numpy(columns).to(touch.device), layout.take(taxels))
 
 
 def check_felt(loaded: LoadedTask, feels: Sequence[Felt]) -> None:
-    """Raise `SpecError` if the sensors' document lacks a sensor for something that is felt, or has mistakes."""
+    """Raise `SpecError` if the sensors' document lacks a sensor for a policy's touch, or has mistakes."""
     _sensors_of(loaded, sensors_document(loaded), {"touch": [each.kind for each in feels]})
 
 
 def types_of(loaded: LoadedTask) -> list[str]:
-    """Return the types that the sensors' document has sensors for, and none."""
+    """Return the touch types that the sensors' document has sensors for, and "none"."""
     return _types([sensor.kind for sensor in sensors_document(loaded).spec.sensors.values()])  # type: ignore[attr-defined]
 
 
@@ -309,7 +309,7 @@ def _sensor_overrides(loaded: LoadedTask) -> dict[str, Any]:
 
 
 def _sensors_of(loaded: LoadedTask, document: Loaded, wanted: Mapping[str, Sequence[str]]) -> dict[str, str]:
-    """Return the document's only sensor of each kind, by kind; `wanted` has them by the task's key that wants them."""
+    """Return the document's only sensor of each kind, by kind; `wanted` has the kinds by the task's key that needs them."""
     sensor, problems = {}, []
     for key, kind in dict.fromkeys((key, kind) for key, some in wanted.items() for kind in some):
         names = [name for name, other in document.spec.sensors.items() if other.kind == kind]  # type: ignore[attr-defined]
@@ -327,14 +327,14 @@ def _sensors_of(loaded: LoadedTask, document: Loaded, wanted: Mapping[str, Seque
 
 
 class SubstepTouch:
-    """The groups of touch after each physics step of the last control step (`temporal: stack`); at a start all are alike."""
+    """The touch groups after each physics step of the last control step (`temporal: stack`); all equal at a start."""
 
     def __init__(self, sensed: Sensed, sim: Simulation):
         self._sensed, self._sim = sensed, sim
         self.stacks: dict[str, Float[Tensor, "env step feature"]] = {}  # live tensors
 
     def step(self, control: Float[Tensor, "env nu"]) -> dict[str, Tensor]:
-        """Make a control step, feeling at each physics step; return the readings of the last one."""
+        """Make a control step with readings at each physics step; return the last ones."""
         readings: dict[str, Tensor] = {}
         for i, state in enumerate(self._sim.substates(control)):
             readings = self._sensed.touch(state)

@@ -1,4 +1,4 @@
-"""What the document of every task says: sensors, joints, physics, touch, actions, and what is random."""
+"""The keys that all task documents share: sensors, joints, physics, touch, actions and randomisation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tgdsl.rl.train.spec import Time, TrainSpec, Whole
 
 
 def touch_types() -> dict[str, tuple[str, type[OfReading]]]:
-    """Return, by word of `touch:`, the kind of sensor that a policy feels with, and the type of observation of its reading."""
+    """Return, by word of `touch:`, the kind of the policy's sensor, and the type of observation of its reading."""
     named = {
         name: (model.task_kind, model)
         for name, model in TYPES.by_name().items()
@@ -40,10 +40,10 @@ Power = Annotated[float, Quantity("number", ge=1.0)]
 
 
 class PhysicsSpec(SpecModel):
-    """How physics is stepped; what is left out is the scene's."""
+    """Options of the physics; null keeps the scene's value."""
 
     collision: Literal["mesh", "primitive"] | None = None
-    """What the robot's links collide with, in place of what the sensors' document says: see `robot.collision` there."""
+    """Collision geoms of the robot's links; default: `robot.collision` of the sensors' document."""
 
     timestep: Time = 0.005
     """Duration of a physics step [s]."""
@@ -56,22 +56,22 @@ class PhysicsSpec(SpecModel):
     integrator: Literal["Euler", "implicit", "implicitfast"] | None = None
     """Integrator."""
     iterations: Whole | None = None
-    """Most iterations of the solver."""
+    """Largest number of solver iterations."""
     ls_iterations: Whole | None = None
-    """Most iterations of its line search."""
+    """Largest number of line-search iterations."""
     tolerance: NonNegative | None = None
-    """Where the solver stops."""
+    """Termination tolerance of the solver."""
     ls_tolerance: NonNegative | None = None
-    """Where its line search stops."""
+    """Termination tolerance of its line search."""
     impratio: Positive | None = None
-    """Ratio of friction's impedance to that of the normal force."""
+    """Ratio of frictional to normal impedance."""
     solref: tuple[Time, Positive] | None = None
-    """Of all contacts, as MuJoCo's geoms have it: time constant [s], at least two timesteps, and damping ratio. A contact's
-    stiffness is also by the masses that meet, and by `solimp`."""
+    """MuJoCo's `solref` of all contacts: time constant [s], at least two timesteps, and damping ratio. A contact's stiffness
+    also depends on the colliding masses and on `solimp`."""
     solimp: tuple[Impedance, Impedance, Radius, Impedance, Power] | None = None
-    """Of all contacts, as MuJoCo's geoms have it: impedances at first and at the width, width [m], midpoint, power."""
+    """MuJoCo's `solimp` of all contacts: impedances at zero and at the width, width [m], midpoint, power."""
     max_torque: dict[str, Annotated[float, Quantity("torque", gt=0.0)]] = {}
-    """By names or shell wildcards of joints, the largest torque of their drives in place of the robot's [N·m; slides: N]."""
+    """Largest torque of the drives, by names or shell wildcards of joints; default: the robot's [N·m; slides: N]."""
     nconmax: Whole | None = None
     """On a GPU, capacity for contacts per environment."""
     njmax: Whole | None = None
@@ -97,7 +97,7 @@ class PhysicsSpec(SpecModel):
 
 
 class PushSpec(SpecModel):
-    """How strongly and how often an object is pushed."""
+    """Strength and timing of an object's pushes."""
 
     x: ForceRange = ZERO
     """Force along the world's x [N]."""
@@ -106,18 +106,18 @@ class PushSpec(SpecModel):
     z: ForceRange = ZERO
     """Force along the world's z [N]."""
     interval: Annotated[Range, RangeOf("time", gt=0.0)] = (2.0, 4.0)
-    """Time from the end of one push to the begin of the next, drawn for each [s]."""
+    """Time from the end of one push to the start of the next, drawn for each [s]."""
     duration: Time = 0.025
-    """How long a push lasts, rounded up to control steps [s]."""
+    """Duration of a push, rounded up to control steps [s]."""
 
 
 class RandomSpec(SpecModel):
-    """Values that are drawn at each reset; a key that is left out is not random."""
+    """Values drawn at each reset; keys left out are not random."""
 
     friction: Factor = ONE
     """Factor on the object's coefficient of sliding friction."""
     mass: Annotated[Range, RangeOf("mass", ge=0.0)] = ZERO
-    """What is added to the object's mass [kg]."""
+    """Mass added to the object [kg]."""
     drive: DriveSpec = DriveSpec()
     """The drives of the joints."""
     push: PushSpec = PushSpec()
@@ -125,27 +125,27 @@ class RandomSpec(SpecModel):
 
 
 class PlacedRandomSpec(RandomSpec):
-    """Of a task whose object is put down freely: where."""
+    """Random values of a task with a free object: its placement too."""
 
     xy: Annotated[Range, RangeOf("length")] = ZERO
-    """What is added to the object's place along the world's x and y, each [m]."""
+    """Offset of the object's start along the world's x and y, each [m]."""
     yaw: Annotated[Range, RangeOf("angle")] = ZERO
-    """By how much the object is turned about the vertical [rad]."""
+    """Rotation of the object about the vertical [rad]."""
 
 
 class ProprioSpec(SpecModel):
-    """How a policy observes its joints, in the group `proprio`."""
+    """Noise and scale of the group `proprio`."""
 
     pos_noise: Annotated[float, Quantity("angle", ge=0.0)] = 0.0
     """Standard deviation of normal noise on positions, drawn at each control step [rad; slides: m]."""
     vel_noise: NonNegative = 0.0
-    """The same on velocities, before they are scaled [rad/s; slides: m/s]."""
+    """The same on velocities, before scaling [rad/s; slides: m/s]."""
     vel_scale: Positive = 1.0
     """Factor on velocities."""
 
 
 class TaskSpec(SpecModel):
-    """What all tasks have in common."""
+    """Keys of all tasks."""
 
     tgdsl: Literal[1]
     """Version of the grammar."""
@@ -153,44 +153,43 @@ class TaskSpec(SpecModel):
     """A task of tgdsl by name, such as `in_palm_rotate`; one of your own as `package.module:Class`, or as `file.py:Class`
     with the file relative to this document."""
     document: str
-    """The sensors' document, relative to this one: robot, scene, objects and sensors, of which those needed are taken."""
+    """The sensors' document, relative to this one: robot, scene, objects and sensors. Only the sensors needed are compiled."""
     sensors: dict[str, dict[str, Any]] = {}
-    """What is otherwise than in the sensors' document, by sensor: `{near: {radius: 4 mm}}`."""
+    """Changes of the sensors' document, by sensor: `{near: {radius: 4 mm}}`."""
     object: str
-    """The document's object that the task is about."""
+    """The task's object in the sensors' document."""
     variants: Annotated[tuple[Annotated[StrictInt, Field(ge=0)], ...], Field(min_length=1)] | None = None
-    """Which of the object's variants there are, by their places in the sensors' document, from 0; default: all."""
+    """Indices of the object's variants in the sensors' document, from 0; default: all."""
     joints: Annotated[tuple[str, ...], Field(min_length=1)]
     """Joints that the policy moves: names or shell wildcards, in the order of the actuators; the others are held."""
     keyframe: str | None = None
-    """The scene's keyframe that episodes start from; default: the model's own initial state."""
+    """The scene's keyframe that episodes start from; default: the model's initial state."""
     physics: PhysicsSpec = PhysicsSpec()
-    """How physics is stepped."""
+    """Options of the physics."""
     episode: Annotated[float, Quantity("time", gt=0.0), Field(le=1e6)] = 10.0
     """Duration of an episode [s]."""
     touch: TouchType = "force_torque"
-    """What a policy feels."""
+    """The policy's type of touch."""
     placement: str = "hand"
-    """Links that feel: a link group of the layout."""
+    """Links with touch: a link group of the layout."""
     resolution: str | None = None
-    """How densely, as the layout has it; default: as the sensors' document says."""
+    """A taxel resolution of the layout; default: the sensors' document's."""
     joint_vel: Literal["exact", "measured"] = "exact"
-    """What velocities `proprio` has: those of the simulation, or what a hand makes of the positions that it reports at each
-    control step, by differences through a low-pass filter of 20 ms; `priv_proprio` always has the former."""
+    """Velocities of `proprio`: `exact`, from the simulation; or `measured`, as a hand computes them: differences of positions
+    at each control step through a low-pass filter of 20 ms. `priv_proprio` always has exact ones."""
     proprio: ProprioSpec = ProprioSpec()
     """Noise and scale of `proprio`; `priv_proprio` has neither."""
     temporal: Literal["last", "stack"] = "last"
-    """Which readings of a control step `tactile_sensors` has: that of its last physics step, or those of all of them, the
-    first one first."""
+    """Readings of a control step in `tactile_sensors`: after its `last` physics step, or a `stack` of all of them in order."""
     noise: str = "clean"
     """A noise profile of the sensors' document, or the built-in `clean` or `noisy`."""
     action: ActionSpec = ActionSpec()
-    """How an action is understood."""
+    """Meaning of a policy's action."""
     randomise: RandomSpec = RandomSpec()
-    """Values that are drawn at each reset."""
+    """Values drawn at each reset."""
     terms: dict[str, dict[str, Any]] = {}
-    """Terms of reward, reasons to end and groups of observations that are added to the task's: see `tgdsl.rl.terms`."""
+    """Additional rewards, terminations, observations, events and curricula: see `tgdsl.rl.terms`."""
     train: TrainSpec = TrainSpec()
-    """How a policy is learned: `tgdsl train`."""
+    """Training of a policy: `tgdsl train`."""
     distill: DistillSpec = DistillSpec()
-    """How students are taught by a policy that is there: `tgdsl distill`."""
+    """Training of students from a trained policy: `tgdsl distill`."""

@@ -1,4 +1,4 @@
-"""The simulation of a task's environments, and the setup that the task is made for."""
+"""The simulation of a task's environments, and the task's setup."""
 
 from __future__ import annotations
 
@@ -60,14 +60,14 @@ def make_simulation(
 ) -> Simulation:
     """Simulate the task's scene; environments with faults wait for a reset."""
     spec = loaded.spec
-    own = loaded.task.watch(spec)
+    task_watch = loaded.task.watch(spec)
     links = contact_links(sensed) if any(term.watches_links for term in loaded.terms.values()) else ()
     watch = Watch(
-        bodies=tuple(dict.fromkeys((sensed.object, *own.bodies, *links))),
-        sites=own.sites,
-        joints=tuple(dict.fromkeys((*joints, *own.joints, *sensed.touch.inputs.joints))),
-        actuators=own.actuators,
-        pairs=own.pairs,
+        bodies=tuple(dict.fromkeys((sensed.object, *task_watch.bodies, *links))),
+        sites=task_watch.sites,
+        joints=tuple(dict.fromkeys((*joints, *task_watch.joints, *sensed.touch.inputs.joints))),
+        actuators=task_watch.actuators,
+        pairs=task_watch.pairs,
     )
     per_env = [name for term in event_terms(spec.randomise, loaded.terms).values() for name in term.per_env]
     options: dict[str, Any] = {"substeps": spec.physics.substeps, "keyframe": spec.keyframe, "options": spec.physics.options}

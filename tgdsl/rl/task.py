@@ -1,8 +1,8 @@
-"""A task: how an episode begins and ends, what is observed and rewarded, and how well it went.
+"""A task: start and end of an episode, observations, rewards and score.
 
-A task is one file in `tgdsl/rl/tasks`, in a fixed order: what is to be done and its groups; the spec; then the class: its
-terms, `reset`, `advance`, `is_over`, `observe`, `score`. Numbers of the document are read in each step, as a curriculum may
-change them, but for those that the class lists as its `constants`.
+A task is one file in `tgdsl/rl/tasks`, in a fixed order: a description of the task and its groups; the spec; then the class
+with its terms, `reset`, `advance`, `is_over`, `observe`, `score`. Numbers of the document are read in each step, as a
+curriculum may change them, except the `constants` of the class.
 
 A term of the reward is a method marked by `reward_term`, or a shared one of `tgdsl.rl.terms` such as `near = Near.of_task(0.1,
 width="near_width")`. The keys under `rewards` of the task's document follow from the terms, in their order; so do keys such as
@@ -47,16 +47,16 @@ S = TypeVar("S", bound=TaskSpec)
 
 
 def checked(what: str, value: object, num_envs: int, ndim: int = 1, dtype: torch.dtype | None = None) -> Tensor:
-    """Return what a task or a term returns: a tensor (env,) or (env, feature), of a dtype if one is given.
+    """Return a value that a task or a term returns, validated: a tensor (env,) or (env, feature), of the dtype if not None.
 
     Raises:
         SimulationError: If it is something else.
     """
     if isinstance(value, Tensor) and value.ndim == ndim and len(value) == num_envs and dtype in (None, value.dtype):
         return value
-    given = f"of shape {tuple(value.shape)} and {value.dtype}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
+    actual = f"of shape {tuple(value.shape)} and {value.dtype}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
     kind = f" of {dtype}" if dtype else ""
-    raise SimulationError(f"{what} is {given}, expected a tensor ({num_envs},{' …' if ndim > 1 else ''}){kind}")
+    raise SimulationError(f"{what} is {actual}, expected a tensor ({num_envs},{' …' if ndim > 1 else ''}){kind}")
 
 
 def free_qpos(model: mujoco.MjModel, name: str) -> slice | None:
@@ -122,7 +122,7 @@ class Now:
     joint_pos: Float[Tensor, "env joint"]  # positions of the joints that the policy moves [rad]
     joint_vel: Float[Tensor, "env joint"]  # their velocities [rad/s]
     target: Float[Tensor, "env joint"]  # position targets of their drives after the last action [rad]
-    torque: Float[Tensor, "env joint"]  # what their drives exert [N·m]
+    torque: Float[Tensor, "env joint"]  # torques of their drives [N·m]
     action: Float[Tensor, "env joint"]  # last action, from −1 to 1; zero at the start of an episode
     last_action: Float[Tensor, "env joint"]  # action of the control step before
     link_force: Float[Tensor, "env link 3"]
@@ -169,7 +169,7 @@ class Features:
 
 
 class Part(NamedTuple):
-    """Part of a group of observations: its numbers, (env, feature), and what they are."""
+    """Part of a group of observations: its numbers, (env, feature), and their description."""
 
     observe: Callable[[Now], Tensor]
     features: Sequence[Features]
@@ -179,10 +179,10 @@ class Start(NamedTuple):
     """How episodes begin."""
 
     values: StateValues
-    """MuJoCo's arrays as for `sim.reset`, (env, …); rows of environments that are not reset mean nothing. With `ctrl` among
-    them drives begin with these targets; else they hold the positions of their joints."""
+    """MuJoCo's arrays as for `sim.reset`, (env, …); rows of environments without a reset are ignored. `ctrl`, if present, sets
+    the drives' targets; else drives hold the positions of their joints."""
     contacts: Contacts = "none"
-    """As for `sim.reset`: "none" for an object that touches nothing yet, or what was stored with a grasp."""
+    """As for `sim.reset`: "none" for an object without contact, or the contacts stored with a grasp."""
 
 
 Rate = Callable[[Now], Float[Tensor, " env"]]  # a term of the reward without its weight
@@ -194,12 +194,12 @@ class TaskReward:
 
     weight: float  # its weight unless the document gives another
     unit: str  # unit of the weight
-    summary: str  # what it is, in a line
+    summary: str  # its description, in a line
     rate_of: Callable[[Any], Rate]  # makes the term of a task
-    name: str | None = None  # its name if it is not that of the attribute
-    term: type[Any] | None = None  # the shared term that it is, a `RewardTerm`; None: one of the task alone
+    name: str | None = None  # its name; default: the attribute's
+    term: type[Any] | None = None  # the shared `RewardTerm`; None: the term is the task's alone
     parameters: Mapping[str, str] = field(default_factory=dict)
-    """The shared term's parameters, each by the key of the task's document that has it."""
+    """Key of the task's document for each parameter of the shared term."""
 
     def __get__(self, task: Task | None, owner: type[Task]) -> Any:
         return self if task is None else self.rate_of(task)
@@ -209,7 +209,7 @@ def reward_term(weight: float, unit: str, name: str | None = None) -> Callable[[
     """Mark a method of a task, which takes `Now` and returns a tensor (env,), as a term of its reward.
 
     Args:
-        weight: Its weight unless the document gives another: of a gain more than 0, of a penalty less.
+        weight: Its default weight: more than 0 for a gain, less for a penalty.
         unit: Unit of the weight, such as "1/s": weight times term is a rate, the reward is the sum of all rates times Δt.
         name: Its name; default: the method's.
     """
@@ -225,20 +225,20 @@ class Task(ABC, Generic[S]):
     """A task of all environments."""
 
     Spec: ClassVar[type[TaskSpec]]  #: model of its document
-    #: kinds of sensors of the sensors' document that it looks at, besides what the policy feels: `now.link_force` is that of
-    #: `link_contact`, `now.distance` that of `surface_distance`
+    #: kinds of sensors that the task reads, in addition to the policy's touch: `link_contact` gives `now.link_force`,
+    #: `surface_distance` gives `now.distance`
     senses: ClassVar[tuple[str, ...]] = ()
-    #: whether it looks at the normal force of the `link_contact` sensor, besides the force
+    #: whether it also reads the normal force of the `link_contact` sensor
     wants_normal_force: ClassVar[bool] = False
     score_unit: ClassVar[str]  #: unit of its score
     is_less_better: ClassVar[bool] = False  #: whether its score is an error
-    #: names of the groups of `observe`, so that loading a document finds wrong ones; None: they are known in environments alone
+    #: names of the groups of `observe`, checked when a document is loaded; None: known only in environments
     own_groups: ClassVar[tuple[str, ...] | None] = None
     #: groups that `observe_hand` computes without a scene: a policy on a hand sees no others of the task
     hand_groups: ClassVar[tuple[str, ...]] = ()
-    #: keys of its document that are read once, when it is made: no curriculum can change them
+    #: keys of its document that no curriculum can change, as `__init__` reads them
     constants: ClassVar[tuple[str, ...]] = ()
-    #: units of the numbers of a goal that a user may give, such as ("N",); none: nothing can be asked for
+    #: units of the numbers of a goal that a user may give, such as ("N",); empty: users cannot give one
     goal_units: ClassVar[tuple[str, ...]] = ()
     terms: ClassVar[Mapping[str, TaskReward]] = {}  #: terms of its reward by name
     Rewards: ClassVar[type[SpecModel]] = SpecModel  #: model of their weights
@@ -279,7 +279,7 @@ class Task(ABC, Generic[S]):
 
     @classmethod
     def watch(cls, spec: S) -> Watch:
-        """Return which bodies, sites, joints and pairs it looks at, besides the object and the joints that the policy moves."""
+        """Return additional bodies, sites, joints and pairs to read; the object and the policy's joints are always read."""
         return Watch()
 
     def keep(self, name: str, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
@@ -300,7 +300,7 @@ class Task(ABC, Generic[S]):
 
         Args:
             chosen: The environments.
-            episode: How often each was reset: the count of its random numbers.
+            episode: Number of resets of each environment: the counter of its random numbers.
         """
 
     @abstractmethod
@@ -316,41 +316,41 @@ class Task(ABC, Generic[S]):
 
     @abstractmethod
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
-        """Return which episodes end for good: not those that merely have lasted long enough."""
+        """Return which episodes terminate; the time limit is not part of it."""
 
     def reward(self, now: Now, is_over: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
         """Return the terms of the reward by name, weights included, as rates: the reward is their sum times Δt [1/s].
 
         Args:
             now: The instant after the control step.
-            is_over: Which episodes have ended for good.
+            is_over: Which episodes have terminated.
         """
         weights: Any = getattr(self.spec, "rewards", None)
         return {name: getattr(weights, name) * rate(now) for name, rate in self._rates.items()}
 
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return groups of observations beside `proprio`, `tactile_sensors` and `priv_proprio`: by default those of `parts`.
+        """Return the groups of observations other than `proprio`, `tactile_sensors` and `priv_proprio`; default: `parts`.
 
         Raises:
             SimulationError: If the task has neither `observe` nor `parts`.
         """
         if not self.parts:
             problem = f"{type(self).__name__}: it has no `observe`, and sets no `self.parts`"
-            raise SimulationError(f"{problem}; a task without groups of its own returns {{}} from `observe`")
+            raise SimulationError(f"{problem}; a task without groups returns {{}} from `observe`")
         return {group: torch.cat([part.observe(now) for part in parts], dim=1) for group, parts in self.parts.items()}
 
     def describe(self) -> Mapping[str, Sequence[Features]]:
-        """Describe the features of `observe`, by group and in order; a group that is left out is "not described"."""
+        """Describe the features of `observe`, by group and in order; a missing group is "not described"."""
         return {group: [each for part in parts for each in part.features] for group, parts in self.parts.items()}
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
-        """Return privileged numbers that `distill.decoders` may name, which students learn to predict; by default none."""
+        """Return the privileged numbers that `distill.decoders` may name for students to predict; by default none."""
         return {}
 
     def step_progress(self) -> Float[Tensor, " env"] | None:
-        """Return the object's progress in this control step, such as an angle, negative for the wrong way; None: it has none.
+        """Return the object's progress in this control step, such as an angle, negative for the wrong way; None without one.
 
-        `tgdsl evaluate` reports the share that is made while no finger touches the object.
+        `tgdsl evaluate` reports the share of progress while no finger touches the object.
         """
         return None
 
@@ -359,7 +359,7 @@ class Task(ABC, Generic[S]):
         """Return the document with this goal, one number per entry of `goal_units`.
 
         Raises:
-            LowerError: If it is not one that the document can ask for.
+            LowerError: If the document does not allow this goal.
         """
         return spec
 

@@ -3,7 +3,7 @@
 A `RewardTerm` adds a rate to the reward, a `TerminationTerm` ends episodes, an `ObservationTerm` adds a group of observations;
 an `EventTerm` changes the simulation at random; a `CurriculumTerm` changes a weight or another number of a term while a policy
 is learned.
-`TERMS` has those that documents may name, those of installed packages included; a user's own is a subclass, named as
+`TERMS` has the terms that documents may name, including terms of installed packages; a user's term is a subclass, named as
 `file.py:Class`.
 
 Symbols: a action; q, q̇ and τ positions, velocities and torques of the joints that the policy moves, m and h middle and half
@@ -11,8 +11,8 @@ width of their ranges; f_l the object's force on link l, d_p the distance from p
 of the drives; v and ω the object's velocity and angular velocity.
 
 Source of the names: Chung et al., *Tactile Genesis*, appendix, "Reward terms", which prints no formulas: these are ours.
-`effort` and `object_speed` are ours altogether. That `near` may take the nearest probes alone, `net_force` and `score_limit`
-are choices of the authors' public code: see docs/records/paper.md.
+`effort` and `object_speed` are ours altogether. The option `nearest` of `near`, `net_force` and `score_limit` follow the
+authors' public code: see docs/records/paper.md.
 
 Shapes: `env` environments, `joint` joints, `link` links, `probe` probes.
 """
@@ -58,11 +58,11 @@ class Term(SpecModel, ABC):
     of a captured step, so no Python branch may depend on a tensor's value.
     """
 
-    senses: ClassVar[tuple[str, ...]] = ()  # kinds of sensors that it looks at: see `Task.senses`
+    senses: ClassVar[tuple[str, ...]] = ()  # kinds of sensors that it reads: see `Task.senses`
     constants: ClassVar[tuple[str, ...]] = ()  # parameters that no curriculum can change
-    watches_links: ClassVar[bool] = False  # whether it looks at where `Setup.links` are: `now.watched.body(link)`
+    watches_links: ClassVar[bool] = False  # whether it reads the poses of `Setup.links`: `now.watched.body(link)`
     term: str | None = None
-    """Which term it is: a name, or `package.module:Class` or `file.py:Class`; default: the name that it has in the document."""
+    """The term: a name, or `package.module:Class` or `file.py:Class`; default: its key in the document."""
 
 
 class RewardTerm(Term):
@@ -70,7 +70,7 @@ class RewardTerm(Term):
 
     unit: ClassVar[str] = "1/s"  # of its weight
     weight: Number
-    """Factor on its rate: more than 0 for what pays, less for what costs."""
+    """Factor on its rate: more than 0 for a gain, less for a penalty."""
 
     @abstractmethod
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
@@ -81,8 +81,8 @@ class RewardTerm(Term):
         """Return the term as one of a task's reward.
 
         Args:
-            weight: Its weight unless the document gives another.
-            parameters: The term's parameters, each by the key of the task's document that has it.
+            weight: Its default weight.
+            parameters: Key of the task's document for each parameter of the term.
         """
 
         def rate_of(task: Task) -> Rate:
@@ -98,7 +98,7 @@ class RewardTerm(Term):
 
 
 class TerminationTerm(Term):
-    """A reason to end an episode for good."""
+    """A condition that terminates an episode."""
 
     @abstractmethod
     def is_over(self, now: Now, setup: Setup) -> Bool[Tensor, " env"]:
@@ -127,26 +127,26 @@ class Event:
     chosen: Bool[Tensor, " env"]  # the environments in which it happens: decide by this mask, not by `if`
     count: Int[Tensor, " env"]
     """Resets of each environment; for events at intervals, events so far, with the episode in the upper 32 bits."""
-    stream: str  # what its random numbers are for
+    stream: str  # purpose of its random numbers
 
     def shares(self, num: int) -> Float[Tensor, "env num"]:
-        """Return random numbers between 0 and 1, float32: others each time that it happens."""
+        """Return random numbers between 0 and 1, float32, new for each event."""
         return self.setup.draws.shares({self.stream: num}, self.count, self.chosen)[self.stream]
 
     def uniform(self, num: int, low: float = 0.0, high: float = 1.0) -> Float[Tensor, "env num"]:
-        """Return random numbers between two bounds, of physics' dtype: others each time that it happens."""
+        """Return random numbers between two bounds, of physics' dtype, new for each event."""
         return within(self.shares(num).to(self.setup.dtype), low, high)
 
 
 class EventTerm(Term):
-    """Something that happens to the simulation, at each reset or after intervals that are drawn."""
+    """A change of the simulation, at each reset or after random intervals."""
 
     changes_model: ClassVar[bool] = False  # whether it changes the scene's model: at a reset it happens before the others
     per_env: ClassVar[tuple[str, ...]] = ()  # properties of objects that differ between environments: see `tgdsl.simulate`
     mode: Literal["reset", "interval"] = "interval"
     """When it happens."""
     interval: Annotated[Range, RangeOf("time", gt=0.0)] = (2.0, 4.0)
-    """Time from the end of one to the begin of the next, drawn for each [s]."""
+    """Time from the end of one to the start of the next, drawn for each [s]."""
 
     @abstractmethod
     def apply(self, event: Event) -> None:
@@ -258,7 +258,7 @@ class Near(RewardTerm):
 
 
 class NetForce(RewardTerm):
-    """Net force of the links on the object beyond what is free, min(max(0, |Σ_l f_l| − f_free), f_most)."""
+    """Net force of the links on the object beyond `free`, min(max(0, |Σ_l f_l| − f_free), f_most)."""
 
     senses = ("link_contact",)
     watches_links = True
@@ -266,7 +266,7 @@ class NetForce(RewardTerm):
     free: Force = 1.0
     """f_free: a smaller net force costs nothing [N]."""
     most: Force = 20.0
-    """f_most: what is more beyond it costs no more [N]."""
+    """f_most: largest force beyond `free` that counts [N]."""
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
         quat = torch.stack([now.watched.body(link).quat for link in setup.links], dim=1)
@@ -275,7 +275,7 @@ class NetForce(RewardTerm):
 
 
 class ObjectSpeed(RewardTerm):
-    """Speed and spin of the object beyond what is free, max(0, |v|/v_free − 1) + max(0, |ω|/ω_free − 1)."""
+    """Speed and spin of the object beyond the free ones, max(0, |v|/v_free − 1) + max(0, |ω|/ω_free − 1)."""
 
     free_speed: Speed = 0.2
     """v_free: a slower object costs nothing [m/s]."""
@@ -365,7 +365,7 @@ class ObjectVelocity(EventTerm):
 
 
 class ResetEvent(EventTerm):
-    """Something that changes what the scene is made of, by default at each reset."""
+    """A change of the scene's parameters, by default at each reset."""
 
     changes_model = True
     mode: Literal["reset", "interval"] = "reset"
@@ -386,11 +386,11 @@ class Friction(ResetEvent):
 
 
 class Mass(ResetEvent):
-    """The object's mass is the scene's and something more."""
+    """The object's mass is the scene's plus a random mass."""
 
     per_env = ("mass",)
     added: Annotated[Range, RangeOf("mass", ge=0.0)]
-    """What is added [kg]."""
+    """Mass added [kg]."""
 
     def apply(self, event: Event) -> None:
         setup = event.setup
@@ -404,9 +404,9 @@ class Placement(ResetEvent):
     mode: Literal["reset"] = "reset"  # pyright: ignore[reportIncompatibleVariableOverride]
     """When it happens."""
     xy: Annotated[Range, RangeOf("length")] = ZERO
-    """What is added to the object's place along the world's x and y, each [m]."""
+    """Offset of the object's start along the world's x and y, each [m]."""
     yaw: Annotated[Range, RangeOf("angle")] = ZERO
-    """By how much the object is turned about the vertical [rad]."""
+    """Rotation of the object about the vertical [rad]."""
 
     def apply(self, event: Event) -> None:
         setup, item = event.setup, event.setup.free_qpos()
@@ -420,7 +420,7 @@ class Placement(ResetEvent):
 
 
 class Drive(ResetEvent):
-    """The drives are drawn again within `randomise.drive`."""
+    """New drive parameters are drawn within `randomise.drive`."""
 
     def apply(self, event: Event) -> None:
         event.actuation.draw(event.chosen, event.count)
@@ -429,8 +429,8 @@ class Drive(ResetEvent):
 class Push(EventTerm, PushSpec):
     """A force in world axes, uniform in a box, acts at the centre of mass of the object's body for a while.
 
-    Source of forces and intervals: Chung et al., *Tactile Genesis*, appendix, "Domain Randomization", which does not say for
-    how long a force acts: a control step is our choice.
+    Source of forces and intervals: Chung et al., *Tactile Genesis*, appendix, "Domain Randomization". It does not give the
+    duration of a force: a control step is our choice.
     """
 
     constants = ("duration",)
@@ -455,11 +455,11 @@ class Linear(CurriculumTerm):
     """`start` up to `first`, `end` from `last` on, and linear between: of iterations, or of the score."""
 
     by: Literal["iteration", "score"] = "iteration"
-    """What it follows; before an episode has ended the score counts as `first`."""
+    """Its variable; before an episode has ended the score counts as `first`."""
     first: Number
     """Where the change begins, in iterations or in the score's unit."""
     last: Number
-    """Where the change ends; for a score of which less is better, less than `first`."""
+    """Where the change ends; less than `first` for a score to minimise."""
     start: Number
     """The number before the change."""
     end: Number

@@ -84,7 +84,7 @@ def test_mistakes_are_named(make, tmp_path):
     with pytest.raises(SpecError, match='no link matches "palm"'):
         make([Felt("depth", "palm", "clean")])
     both = [Felt("depth", "all", noise) for noise in ("noisy", "other")]
-    with pytest.raises(SpecError, match="noise noisy, other of one sensor in one simulation, expected one beside clean"):
+    with pytest.raises(SpecError, match="noise noisy, other of one sensor in one simulation, expected at most one and clean"):
         make(both)
     assert load_task(tmp_path / "task.yaml").spec.touch == "bool"
 

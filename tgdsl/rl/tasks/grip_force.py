@@ -2,38 +2,37 @@
 
 An episode begins with the object held: gravity pulls it out along the fingertips' surfaces. The command F* is a sum of normal
 forces, and changes at random times. With s_l the sum of the normal forces of the object's contacts with link l, p and q the
-object's position and orientation, p_0 and q_0 those at the start,
+object's position and orientation, p_0 and q_0 their values at the start,
 
     F   = Σ_l s_l,   e = F / F* − 1                             sum of normal forces [N], its relative error [1]
     F*  = F_min + u (F_max − F_min),   u ∈ U(0, 1)              command [N], drawn at the start and every 2 to 4 s
     F_min = max(F_low, κ m g / μ)                               least force that is commanded [N]
-    θ   = angle(q q_0⁻¹)                                        by how much the object has turned [rad]
+    θ   = angle(q q_0⁻¹)                                        angle by which the object has turned [rad]
 
-The start is the keyframe of the object's variant, held with F_0, and its drives' targets w for the first command
+The start is the keyframe of the object's variant, held with F_0. The drives' targets w for the first command are
 
     w   = q_j + F*/F_0 (w_0 − q_j)                              q_j joint positions, w_0 the keyframe's controls [rad]
 
-so that the force is F* but for how far contacts give way, which in MuJoCo depends on the mass: without an action half of all
-objects are held with F* to 7 %, and a light one with 8 N to 15 %. What is felt of contacts in the start's instant is zero, as
-after every reset that stores none.
+The force is then F* up to the contacts' compliance, which in MuJoCo depends on the mass: without an action half of all objects
+are held with F* to 7 %, and a light one with 8 N to 15 %. Contact readings are zero at the start, as after every reset without
+stored contacts.
 
 Groups: `goal` holds F* [N]; `priv_force` F and s_l of each link [N]; `priv_obj_state` and `priv_obj_props` as in `groups`.
 
-The error that pays is that to the command which was known before the step.
+The reward uses the error to the command before the step.
 
-An episode ends for good where the object is dropped or crushed. Both force terms are 0 or more and end with the object: to hold
-on pays in any case.
+An episode terminates where the object is dropped or crushed. Both force terms are 0 or more and end with the object, so holding
+on always pays.
 
-Score: root of the mean of e² over all steps later than `settling` after the last change of the command, the start being one; 1,
-as without any force, until there is such a step. Less is better. It says nothing of drops: the share of episodes without a drop
-is that of those which end truncated and not terminated; `episode_terms` tells drops from crushes.
+Score: root mean square of e over all steps later than `settling` after the last change of the command or the start; 1, as
+without any force, before the first such step. Less is better. The score ignores drops: episodes without one end truncated, not
+terminated; `episode_terms` distinguishes drops from crushes.
 
-Source: ours, for what a force follows that no depth tells; `drop`, `joint_limit` and `work` have the weights that Chung et al.,
-*Tactile Genesis*, appendix, "Reward terms", have for tasks in the palm. A command that could not carry the object with a margin
-κ would ask for a drop, so it is not drawn: of 96 objects of 120 to 300 g that a script held with exactly F_min for ten seconds
-91, 33, 3 and 0 fell with κ = 1, 1.15, 1.3 and 1.4; ours is 1.5. Torque noise of 10 % of the largest torque, as the paper's
-tasks have it, is a noise of 1 N of the force, and shakes three objects of five out of the hand: the document has 1 %. Crushing
-ends the episode, since what is crushed stays so.
+Source: ours, a task for force where depth does not suffice; `drop`, `joint_limit` and `work` have the weights that Chung et
+al., *Tactile Genesis*, appendix, "Reward terms", have for tasks in the palm. Commands that could not carry the object with a
+margin κ are not drawn. A script held 96 objects of 120 to 300 g with exactly F_min for ten seconds: 91, 33, 3 and 0 fell with
+κ = 1, 1.15, 1.3 and 1.4; ours is 1.5. The paper's torque noise, 10 % of the largest torque, is a noise of 1 N of the force and
+shakes three objects of five out of the hand: the document has 1 %. Crushing is irreversible, so it ends the episode.
 """
 
 from __future__ import annotations
@@ -65,19 +64,19 @@ class GripForceSpec(TaskSpec):
     start_force: terms.Force = 5.0
     """F_0, sum of normal forces in these keyframes [N]."""
     force: Annotated[Range, RangeOf("force", gt=0.0)] = (1.0, 8.0)
-    """F_low and F_max, least and largest sum of normal forces that is commanded [N]."""
+    """F_low and F_max, least and largest commanded sum of normal forces [N]."""
     hold_margin: Positive = 1.5
-    """κ: no less is commanded than so many times what carries the object by friction [1]."""
+    """κ: least command over the force that carries the object by friction [1]."""
     change: Annotated[Range, RangeOf("time", gt=0.0)] = (2.0, 4.0)
     """Time from one command to the next, drawn for each [s]."""
     settling: Time = 1.0
     """Time after a change of the command that does not count for the score [s]."""
     force_width: Positive = 0.2
-    """σ, relative error at which `force_near` has fallen to 1/e [1]."""
+    """σ, relative error at which `force_near` is 1/e [1]."""
     free_distance: PositiveLength = 0.005
-    """r: closer to where it started, the object costs nothing [m]."""
+    """r: distance from the object's start without a penalty [m]."""
     drop_distance: PositiveLength = 0.04
-    """d_max: further from where it started, the object is lost [m]."""
+    """d_max: distance from its start beyond which the object is lost [m]."""
     max_force: terms.Force = 15.0
     """F_crush: a larger sum of normal forces crushes the object [N]."""
 
@@ -102,7 +101,7 @@ class GripForce(terms.HandTask[GripForceSpec]):
 
     @reward_term(1.0, "1/s")
     def force_far(self, now: Now) -> Float[Tensor, " env"]:
-        """Force less than as far from the command as none at all, max(0, 1 − |e|)."""
+        """Force closer to the command than zero force, max(0, 1 − |e|)."""
         return (1.0 - self.error.abs()).clamp(min=0.0)
 
     @reward_term(-100.0, "1/(m s)")
@@ -112,7 +111,7 @@ class GripForce(terms.HandTask[GripForceSpec]):
 
     @reward_term(-1.0, "1/(rad s)")
     def object_angle(self, now: Now) -> Float[Tensor, " env"]:
-        """By how much the object has turned, θ."""
+        """Angle by which the object has turned, θ."""
         return rotations.between(now.object.quat, self.start_quat)
 
     @reward_term(-100.0, "1/s")
@@ -182,7 +181,7 @@ class GripForce(terms.HandTask[GripForceSpec]):
         return Start({"qpos": self.qpos, "ctrl": ctrl})
 
     def advance(self, now: Now) -> None:
-        """Note the error to the command, and give another command where it is time."""
+        """Record the error to the command, and draw another command where it is due."""
         self.since += 1
         self.error.copy_(now.normal_force.sum(dim=1) / self.command - 1.0)
         is_settled = self.since >= self.settled
@@ -207,7 +206,7 @@ class GripForce(terms.HandTask[GripForceSpec]):
         return torch.where(self.samples > 0, mean.sqrt(), 1.0)
 
     def _command(self, chosen: Bool[Tensor, " env"], mass: Float[Tensor, " env"], friction: Float[Tensor, " env"]) -> None:
-        """Draw commands of some environments, and when the next ones come."""
+        """Draw commands of some environments, and the time of the next ones."""
         spec, draws = self.spec, self.setup.draws
         low, high = spec.force
         least = (spec.hold_margin * self.weight * mass / friction).clamp(min=low, max=high)

@@ -1,8 +1,8 @@
-"""Find, among balls that look and move alike, the one that is hot, and stay on it: only temperature tells which it is.
+"""Find the hot one among balls that look and move alike, by temperature alone, and stay on it.
 
-An episode begins with the hand above a tilted bin and each ball near a place of its own; which place is the hot ball's is
-random. A grid of temperatures on each finger link is read. With T_ic what that of link i reads in cell c, f_l the hot ball's
-force on fingertip l, d_p the distance from probe p of the fingertips to its surface,
+An episode begins with the hand above a tilted bin and each ball near a separate place; the hot ball's place is random. Each
+finger link has a grid of temperatures. With T_ic the reading of link i's grid in cell c, f_l the hot ball's force on
+fingertip l, d_p the distance from probe p of the fingertips to its surface,
 
     π_i = clamp((max_c T_ic − T_a)/(T_h − T_a), 0, 1)           progress of a link [1]
     π   = max_i π_i                                             progress of the hand [1]
@@ -11,17 +11,16 @@ force on fingertip l, d_p the distance from probe p of the fingertips to its sur
     S   = Σ_t Δt b_t c_t                                        latched contact [s]
 
 Groups: `priv_heat` holds π_i of each link, b and c; `priv_obj_state` and `priv_obj_props` are of the hot ball, as in `groups`.
-The policy must have none of them: `proprio` and `tactile_sensors`, with `touch: temperature`, are what it has.
+The policy must see none of them: it has `proprio` and `tactile_sensors` with `touch: temperature`.
 
-An episode ends for good where the hot ball has left the bin: its middle is below `lost_height`. Score: S.
+An episode terminates where the hot ball has left the bin: its centre is below `lost_height`. Score: S.
 
-Source: Chung et al., *Tactile Genesis*, appendix, "Task and Success Metric": bin, balls, temperatures, what is observed, π_i,
-the latch with m = 0.12, and S. The paper prints no reward: ours is S's integrand, before it the progress that fires the latch,
-before that the contact without which there is none, and the way there; the latch is worth more than all the others. What is
-`lost`, `action_rate` and `work` have the weights of its tasks in the palm. π is the hot ball's heat, unless a source in the
-links makes some. f_min is ours, so that rounding is no contact. A fingertip that leans on a cold ball too reads the mean of
-both, and never latches. Friction and mass of the hot ball alone would tell it from the others, and so would pushes: they are
-refused.
+Source: Chung et al., *Tactile Genesis*, appendix, "Task and Success Metric": bin, balls, temperatures, observations, π_i, the
+latch with m = 0.12, and S. The paper prints no reward. Ours rewards approach, then contact, then the progress that fires the
+latch, and last S's integrand, which is worth more than all other terms. `lost`, `action_rate` and `work` have the weights of
+the paper's palm tasks. π comes from the hot ball alone unless a link has a heat source. f_min is ours and excludes rounding
+errors. A fingertip that also leans on a cold ball reads the mean of both, and never latches. Random friction, mass or pushes
+would apply to the hot ball alone and identify it: they are refused.
 """
 
 from __future__ import annotations
@@ -45,13 +44,13 @@ class HotBallRandomSpec(RandomSpec):
     """Random values."""
 
     xy: Annotated[Range, RangeOf("length")] = (0.0, 0.0)
-    """What is added to each ball's place along the world's x and y, each [m]."""
+    """Offset of each ball's place along the world's x and y, each [m]."""
 
     @model_validator(mode="after")
     def _check(self) -> HotBallRandomSpec:
-        given = [name for name in ("friction", "mass", "push") if getattr(self, name) != getattr(RandomSpec(), name)]
-        if given:
-            raise ValueError(f"`{given[0]}` would be the hot ball's alone and tell it from others: expected it to be left out")
+        names = [name for name in ("friction", "mass", "push") if getattr(self, name) != getattr(RandomSpec(), name)]
+        if names:
+            raise ValueError(f"`{names[0]}` would be the hot ball's alone and tell it from others: expected it to be left out")
         return self
 
 
@@ -59,7 +58,7 @@ class HotBallSpec(TaskSpec):
     """Find the hot ball, and stay on it."""
 
     others: tuple[str, ...] = ()
-    """Bodies of the other balls: each may be where the keyframe has another one, or the hot one."""
+    """Bodies of the other balls; episodes permute the keyframe's places among all balls."""
     randomise: HotBallRandomSpec = HotBallRandomSpec()
     """Random values."""
     ambient: Temperature = 22.0
@@ -73,7 +72,7 @@ class HotBallSpec(TaskSpec):
     near_width: PositiveLength = 0.2
     """λ, decay length of `approach` [m]."""
     lost_height: Length = 0.06
-    """Where the hot ball's middle is lower, it has left the bin [m]."""
+    """Height of the hot ball's centre below which it has left the bin [m]."""
 
     @model_validator(mode="after")
     def _check(self) -> HotBallSpec:
@@ -116,7 +115,7 @@ class HotBall(terms.HandTask[HotBallSpec]):
         return self.is_over(now)
 
     def __init__(self, spec: HotBallSpec, setup: Setup):
-        """Look up the balls, and the cells of each link; raise `LowerError` if another ball is no body that moves freely."""
+        """Look up the balls, and the cells of each link; raise `LowerError` if another ball has no free joint."""
         super().__init__(spec, setup)
         self.places = _places(spec, setup).to(setup.device)
         self.heat, table = setup.rows["temperature_grid"]
@@ -134,7 +133,7 @@ class HotBall(terms.HandTask[HotBallSpec]):
         }
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
-        """Give the balls each other's places, from a random one on, and move each a little."""
+        """Rotate the balls' places by a random number, and offset each ball."""
         draws, num = self.setup.draws, len(self.places)
         qpos = self.setup.qpos.repeat(self.setup.num_envs, 1)
         first = draws.integers("place", episode, 1, 0, num - 1)
@@ -147,7 +146,7 @@ class HotBall(terms.HandTask[HotBallSpec]):
         return Start({"qpos": qpos})
 
     def advance(self, now: Now) -> None:
-        """Look at how hot links are and what is touched, and hold the latch."""
+        """Update the links' progress, contact and the latch."""
         spec = self.spec
         reading = now.readings[self.heat].to(self.progress)[:, :, 0]
         above = reading[:, self.cells].amax(dim=2) - spec.ambient

@@ -1,37 +1,36 @@
 """Turn an object on the palm to one orientation after another, with all fingers.
 
 An episode begins with the object upright on the palm, turned about the vertical by any angle. The first goal is a rotation by
-α = `goal_step` from there about an axis that is drawn, each other one such a rotation from the goal before, so that errors do
-not add up. With q the object's orientation, g_k goal k, a_k its axis of unit length in the world, and p and p_0 the object's
-position now and at the start,
+α = `goal_step` from there about a random axis. Each later goal is such a rotation of the previous goal, so errors do not
+accumulate. With q the object's orientation, g_k goal k, a_k its unit axis in the world, and p and p_0 the object's position now
+and at the start,
 
     g_0 = rot(a_0, α) q_0,   g_{k+1} = rot(a_{k+1}, α) g_k                goals
     φ   = angle(g_k q⁻¹)                                                   angle to the goal, from 0 to π [rad]
     k ← k + 1  where φ < ε for `goal_hold` control steps in a row          goal reached
 
-a_k is uniform on the sphere (`goal_axis: any`), or the vertical, up or down (`vertical`). With `goal_axis: xy` a goal is turned
-from the one before about the world's x and then about its y, each by an angle that is uniform within ± α. Boxes and cylinders
-look alike from several sides; a goal is one orientation all the same. The default is the vertical, as the hand reaches little
-else: a planner that knows the physics (`benchmarks/reachable_goals.py`, the XHand1, few episodes) reaches 0, 6 and 17 goals in
-a row about it, and 0 to 5 about any axis.
+a_k is uniform on the sphere (`goal_axis: any`), or the vertical, up or down (`vertical`). With `goal_axis: xy` the previous
+goal is turned about the world's x and then its y, each by an angle uniform within ± α. Boxes and cylinders look alike from
+several sides, but a goal is a single orientation. The default is the vertical, as the hand reaches little else: a planner that
+knows the physics (`benchmarks/reachable_goals.py`, the XHand1, few episodes) reaches 0, 6 and 17 goals in a row about it, and
+0 to 5 about any axis.
 
-Groups: `goal` holds six numbers of the goal's orientation in the world and φ [rad], or what else the document's `goal` lists;
+Groups: `goal` holds six numbers of the goal's orientation in the world and φ [rad]; the document's `goal` may list other parts.
 `priv_obj_state` and `priv_obj_props` as in `groups`.
 
-Weights of the reward's terms are the paper's. φ and φ' are angles at the end and at the begin of the control step, both to the
-goal that it was made for.
+Weights of the reward's terms are the paper's. φ' and φ are the angles to the step's goal at the start and at the end of the
+control step.
 
-An episode ends for good where the object is further than `drop_distance` from p_0, or below it, or where a goal is not reached
-within `goal_timeout`, of which a range is drawn for each goal: what has failed is not worth what would have come. Score: goals
-in a row, k.
+An episode terminates where the object is further than `drop_distance` from p_0, or below it, or where a goal is not reached
+within `goal_timeout`, a time or a range to draw from for each goal; future rewards are then lost. Score: goals in a row, k.
 
-Nothing pays for turning the wrong way: a turn away makes both tracking terms smaller, and costs in `progress` what the way back
-pays at most, as a loss is not clipped. Nor does waiting beside a goal: at φ = ε tracking pays 13.8 until the timeout, which
-costs 5, and `success` 12.5 at once.
+Turning the wrong way does not pay: it lowers both tracking terms, and costs in `progress` at least as much as the way back
+pays, as losses are not clipped. Nor does waiting near a goal: at φ = ε tracking pays 13.8 until the timeout, which costs 5,
+while `success` pays 12.5 at once.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names;
 formulas, Δt as a factor of all terms, goals and how they are reached, α, ε, σ, φ_0, ω_max, λ and f_max are ours. Its text also
-speaks of penalties of grip and slip, which its table does not have, and which are left out.
+mentions penalties of grip and slip, which are missing in its table and here.
 """
 
 from __future__ import annotations
@@ -56,36 +55,36 @@ from tgdsl.tensors.env_ids import may_be_nonempty
 
 
 class Train(with_defaults(TrainSpec, iterations=20000)):
-    """How a policy is learned; the paper's numbers for this task."""
+    """Training of a policy; the paper's numbers for this task."""
 
 
 class Distill(with_defaults(DistillSpec, max_grad_norm=None)):
-    """How students are taught; the paper's numbers for this task."""
+    """Training of students; the paper's numbers for this task."""
 
 
 class InHandReposeSpec(PlacedTaskSpec, ProgressSpec):
     """Turn an object in the hand to one orientation after another."""
 
     train: Train = Train()
-    """How a policy is learned: `tgdsl train`."""
+    """Training of a policy: `tgdsl train`."""
     distill: Distill = Distill()
-    """How students are taught by a policy that is there: `tgdsl distill`."""
+    """Training of students from a trained policy: `tgdsl distill`."""
     goal_step: Angle = 0.4
-    """α: how far a goal is from the one before [rad]."""
+    """α: angle between consecutive goals [rad]."""
     goal_axis: Literal["any", "vertical", "xy"] = "vertical"
-    """About what a goal is turned: any axis; the vertical, either way; or the world's x and then its y, each by up to ± α."""
+    """Axis of a goal's rotation: any; the vertical, either way; or the world's x and then its y, each by up to ± α."""
     goal_tolerance: Angle = 0.1
-    """ε: a goal is reached this close to it [rad]."""
+    """ε: angle to a goal below which it is reached [rad]."""
     goal_hold: Whole = 4
-    """How many control steps in a row the object is that close before the goal counts."""
+    """Number of consecutive control steps within ε before a goal is reached."""
     goal_timeout: Annotated[Range, RangeOf("time", gt=0.0)] = (5.0, 5.0)
-    """An episode ends where a goal is not reached within this, drawn for each goal [s]."""
+    """Time limit of a goal, after which the episode terminates, drawn for each goal [s]."""
     track_width: Angle = 0.2
     """σ, width of `track_gaussian` [rad]."""
     track_half: Angle = 0.1
-    """φ_0, angle at which `track_inverse` is half of its most [rad]."""
+    """φ_0, angle at which `track_inverse` is half its maximum [rad]."""
     drop_distance: PositiveLength = 0.08
-    """Further from where it started, or below, the object is lost [m]."""
+    """Distance from its start (or below it: `drop_measure`) beyond which the object is lost [m]."""
 
     @model_validator(mode="after")
     def _within_reach(self) -> InHandReposeSpec:
@@ -125,7 +124,7 @@ class InHandRepose(terms.HandTask[InHandReposeSpec]):
 
     @reward_term(0.2, "1/rad")
     def progress(self, now: Now) -> Float[Tensor, " env"]:
-        """Rate at which the angle to the goal gets smaller, min((φ' − φ)/Δt, ω_max)."""
+        """Rate at which the angle to the goal decreases, min((φ' − φ)/Δt, ω_max)."""
         return self.spec.pay(self.rate)
 
     near = terms.Near.of_task(0.5, width="near_width")
@@ -151,7 +150,7 @@ class InHandRepose(terms.HandTask[InHandReposeSpec]):
         self.up = torch.tensor([0.0, 0.0, 1.0], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
         self.step = torch.full((setup.num_envs,), spec.goal_step, dtype=setup.dtype, device=setup.device)
         self.start_pos, self.goal = self.keep("start_pos", 3), self.keep("goal", 4)
-        self.error, self.rate = self.keep("error"), self.keep("rate")  # φ of the last step's goal, and how fast it got smaller
+        self.error, self.rate = self.keep("error"), self.keep("rate")  # φ of the last step's goal, and its rate of decrease
         self.left = self.keep("left")  # φ of the present goal
         self.episode, self.reached = self.keep("episode", dtype=torch.int64), self.keep("reached", dtype=torch.int64)
         self.held, self.waited = self.keep("held", dtype=torch.int64), self.keep("waited", dtype=torch.int64)
@@ -163,7 +162,7 @@ class InHandRepose(terms.HandTask[InHandReposeSpec]):
         }
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
-        """Put objects upright on the palm, moved and turned at random, and give each a first goal."""
+        """Place objects upright on the palm, moved and turned at random, and draw their first goals."""
         pos, quat = self.setup.start[:, self.item].split([3, 4], dim=1)
         for buffer in (self.reached, self.held, self.waited, self.is_reached, self.is_late):
             buffer.masked_fill_(chosen, 0)
@@ -174,7 +173,7 @@ class InHandRepose(terms.HandTask[InHandReposeSpec]):
         return Start({"qpos": self.setup.start})
 
     def advance(self, now: Now) -> None:
-        """Measure how far the goal is, and give another one where it was reached."""
+        """Measure the angle to the goal, and draw the next goal where it is reached."""
         spec, quat = self.spec, now.object.quat
         error = rotations.between(self.goal, quat)
         self.rate.copy_(((self.left - error) / self.setup.control_step).clamp(max=spec.max_spin))
@@ -196,7 +195,7 @@ class InHandRepose(terms.HandTask[InHandReposeSpec]):
         return self.drop(now) | self.is_late
 
     def step_progress(self) -> Float[Tensor, " env"]:
-        """Return by how much the object has come closer to its goal in this control step [rad]."""
+        """Return the decrease of the angle to the goal in this control step [rad]."""
         return self.rate * self.setup.control_step
 
     def score(self) -> Float[Tensor, " env"]:
@@ -204,7 +203,7 @@ class InHandRepose(terms.HandTask[InHandReposeSpec]):
         return self.reached.to(self.setup.dtype)
 
     def _goal_after(self, quat: Float[Tensor, "env 4"]) -> Float[Tensor, "env 4"]:
-        """Return orientations turned by a goal's step: those of goal `reached`."""
+        """Return orientations turned by a goal's step, drawn for goal number `reached`."""
         draws, count = self.setup.draws, self._goal_count()
         if self.spec.goal_axis == "xy":
             angles = draws.uniform("goal angles", count, 2, -self.spec.goal_step, self.spec.goal_step).to(quat.dtype)

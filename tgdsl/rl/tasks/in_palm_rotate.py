@@ -1,29 +1,27 @@
 """Turn an object that lies on the palm about the vertical, with some of the fingers, one quarter turn after another.
 
-An episode begins with the object upright near the middle of the palm. The goal is a quarter turn further about the vertical n,
-and each time that it is reached, another one. With q the object's orientation, q_0 that at the start, p and p_0 its positions,
-and n up for `direction: counterclockwise`, down for `clockwise`, as seen from above,
+An episode begins with the object upright near the middle of the palm. Each goal is a quarter turn about the vertical n from
+the previous one. With q the object's orientation, q_0 its start, p and p_0 its positions, and n up for
+`direction: counterclockwise`, down for `clockwise`, as seen from above,
 
     ψ_t = ψ_{t−1} + twist_n(q_t q_{t−1}⁻¹)                      angle turned so far [rad]
     θ   = swing_n(q q_0⁻¹)                                      tilt [rad]
     g   = (k + 1) π/2                                           goal; k goals were reached, k ← k + 1 where g − ψ < ε, θ < θ_max
 
-Groups: `goal` holds six numbers of the goal's orientation, rot_n(g) q_0, and the angle from there to q [rad], by which whoever
-sees it knows the object's exact angle, or what else the document's `goal` lists; `priv_obj_state` and `priv_obj_props` as in
-`groups`.
+Groups: `goal` holds six numbers of the goal's orientation, rot_n(g) q_0, and the angle from there to q [rad], which reveals the
+object's exact angle; the document's `goal` may list other parts. `priv_obj_state` and `priv_obj_props` as in `groups`.
 
 Weights of the reward's terms are the paper's. Progress pays c, 1 where the object is held, else `hold.coasting_pay`: see
-`parts`. s is the share of Σ max(0, Δψ) since the goal
-before that was paid, Σ c max(0, Δψ) over it. By default c = s = 1: whether an object is held or coasts makes no difference.
+`parts`. s is Σ c max(0, Δψ) over Σ max(0, Δψ) since the previous goal. By default c = s = 1: coasting pays as much as holding.
 
-`spin` pays a bounded rate, see `parts`, and up to a tilt of `spin_tilt` alone.
+`spin` pays a bounded rate, see `parts`, and only up to a tilt of `spin_tilt`.
 
-An episode ends for good where the object is further than `drop_distance` from p_0, or below it. Score: quarter turns, k.
+An episode terminates where the object is further than `drop_distance` from p_0, or below it. Score: quarter turns, k.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names;
 formulas, Δt as a factor of all terms, goal, ε, θ_max, ω_max, λ, r and f_max are ours, and so are `effort`, `object_speed`, c
-and s. Turning back costs what turning forth has paid, however fast, as `spin` is bounded above alone, and no less for an object
-that coasts; goals that were reached stay reached.
+and s. Turning back costs as much as turning forward pays, at any speed, as `spin` is bounded above alone; coasting back costs
+no less. Reached goals stay reached.
 """
 
 from __future__ import annotations
@@ -46,32 +44,32 @@ QUARTER = 0.5 * math.pi
 
 
 class Distill(DistillSpec):
-    """How students are taught; the paper's numbers for this task."""
+    """Training of students; the paper's numbers for this task."""
 
     decoders: dict[str, DecoderSpec] = {"object_size": DecoderSpec(scale=20.0), "goal_distance": DecoderSpec()}
-    """Heads by the privileged number that they tell: the object's height [m], and its angle to the goal [rad]."""
+    """Heads by the privileged number that they predict: the object's height [m], and its angle to the goal [rad]."""
 
 
 class InPalmRotateSpec(PlacedTaskSpec, ProgressSpec):
     """Turn an object on the palm about the vertical."""
 
     distill: Distill = Distill()
-    """How students are taught by a policy that is there: `tgdsl distill`."""
+    """Training of students from a trained policy: `tgdsl distill`."""
 
     direction: Literal["counterclockwise", "clockwise"] = "counterclockwise"
-    """Which way the object is to turn, seen from above."""
+    """Direction of rotation, seen from above."""
     goal_tolerance: Angle = 0.1
-    """ε: a goal is reached this close to it [rad]."""
+    """ε: angle to a goal below which it is reached [rad]."""
     max_tilt: Angle = 0.4
-    """θ_max: no goal is reached with a larger tilt [rad]."""
+    """θ_max: largest tilt at which a goal is reached [rad]."""
     spin_tilt: Angle | None = None
-    """With a larger tilt `spin` is 0 [rad]; null: it never is."""
+    """Tilt above which `spin` is 0 [rad]; null: no bound."""
     free_distance: PositiveLength = 0.02
-    """r: closer to where it started, the object costs nothing [m]."""
+    """r: distance from the object's start without a penalty [m]."""
     drop_distance: PositiveLength = 0.07
-    """Further from where it started, or below, the object is lost [m]."""
+    """Distance from its start (or below it: `drop_measure`) beyond which the object is lost [m]."""
     hold: HoldSpec = HoldSpec()
-    """What progress pays while the object coasts; by default as much as while it is held."""
+    """Reward of progress while the object coasts; by default the same as while it is held."""
 
 
 class InPalmRotate(terms.HandTask[InPalmRotateSpec]):
@@ -84,7 +82,7 @@ class InPalmRotate(terms.HandTask[InPalmRotateSpec]):
 
     @reward_term(150.0, "1/s")
     def success(self, now: Now) -> Float[Tensor, " env"]:
-        """Goal reached: s in the step that reaches one."""
+        """Goal reached in this step: s."""
         return self.is_reached * self.share
 
     @reward_term(2.0, "1/rad")
@@ -146,7 +144,7 @@ class InPalmRotate(terms.HandTask[InPalmRotateSpec]):
         return Start({"qpos": self.setup.start})
 
     def advance(self, now: Now) -> None:
-        """Add up what the object has turned, and give it another goal where it has reached one."""
+        """Accumulate the object's rotation, and set the next goal where one is reached."""
         quat = now.object.quat
         since = rotations.product(quat.expand(2, -1, -1), rotations.inverse(torch.stack([self.quat, self.start_quat])))
         step = rotations.twist(since[0], self.axis)

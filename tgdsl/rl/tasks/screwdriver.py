@@ -1,9 +1,9 @@
 """Spin a screwdriver about its long axis, its tip in a screw: a gait of thumb and fingers.
 
-An episode begins with a grasp that was sampled beforehand: see `tgdsl.rl.grasps`. The right way is clockwise as seen from the
-handle, which drives a screw in. With q the object's orientation, a its body's z in the world, from the tip to the handle, n the
-vertical, p the position of its body, which is the handle's middle, p_0 that of the keyframe, where it stands upright, s and s_0
-those of the site at its tip, and j the joints that the policy moves, j_0 at the start of the episode,
+An episode begins with a sampled grasp: see `tgdsl.rl.grasps`. The right way is clockwise as seen from the handle, which drives
+a screw in. With q the object's orientation, a its body's z in the world, from the tip to the handle, n the vertical, p the
+position of its body, the handle's middle, p_0 its position in the keyframe, where it stands upright, s and s_0 the tip's
+positions, and j the joints that the policy moves, j_0 at the start of the episode,
 
     Δψ = −twist_z(q_{t−1}⁻¹ q_t)                                angle turned in a control step, about its own axis [rad]
     θ  = ∠(a, n)                                                tilt [rad]
@@ -15,19 +15,19 @@ Weights of the reward's terms are the paper's. Progress pays c, 1 where the obje
 default: see `parts`. At 2 rad/s `spin` is worth 20 1/s; `near` is worth 1 if all probes touch, `drop` −2.5 in all,
 `joint_limit` −1.9 for a finger stretched out, `action_rate` −0.05 for random actions of eight joints, `work` −0.002 at 2 W.
 
-So a spin of 2 rad/s pays up to a tilt of 15°; `spin` pays a bounded rate, see `parts`. An episode ends for good where
-θ > `drop_tilt`, where the tip is out of the screw, |s − s_0| > `engagement`, or with `stall` where Σ Δψ does not exceed by
-`stall.turn` within `stall.within` what it was. Score: what was turned at a tilt of less than 20°, over the duration of a whole
-episode [rad/s]: after a drop nothing is added.
+So a spin of 2 rad/s pays up to a tilt of 15°; `spin` pays a bounded rate, see `parts`. An episode terminates where
+θ > `drop_tilt`, where the tip is out of the screw, |s − s_0| > `engagement`, or, with `stall`, where Σ Δψ does not grow by
+`stall.turn` within `stall.within`. Score: angle turned at a tilt of less than 20°, over the duration of a whole episode
+[rad/s]: after a drop nothing is added.
 
-The scene's handles are cylinders, a box and capsules. An ellipsoid would be as telling to the hand, but its distance takes 18
-Newton steps (`geometry.shapes`), which take minutes to compile on a GPU, and against it MuJoCo Warp's search for the deepest
-point of two convex shapes runs out of room.
+The scene's handles are cylinders, a box and capsules. An ellipsoid would be as informative, but its distance takes 18 Newton
+steps (`geometry.shapes`), which take minutes to compile on a GPU, and MuJoCo Warp's search for the deepest point between two
+convex shapes runs out of memory against it.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names;
 formulas, Δt as a factor of all terms, the way to turn, ω_max, λ, r, c, the last two terms, the ends of episodes and the 20° of
 the score are ours.
-Turning back costs what turning forth has paid, however fast, and no less while the object coasts: `spin` is bounded above
+Turning back costs as much as turning forward pays, at any speed, and no less while the object coasts: `spin` is bounded above
 alone.
 """
 
@@ -55,7 +55,7 @@ UPRIGHT = math.radians(20.0)  # tilt below which a turn counts for the score [ra
 
 
 class Train(with_defaults(TrainSpec, iterations=5000, steps=12, discount=0.99, entropy=0.0)):
-    """How a policy is learned; the paper's numbers for this task."""
+    """Training of a policy; the paper's numbers for this task."""
 
 
 class Distill(
@@ -70,12 +70,12 @@ class Distill(
         clip=0.1,
     )
 ):
-    """How students are taught; the paper's numbers for this task."""
+    """Training of students; the paper's numbers for this task."""
 
     decoders: dict[str, DecoderSpec] = {
         name: DecoderSpec(weight=0.5, hidden=(512, 128)) for name in ("object_tilt", "rotation_progress")
     }
-    """Heads by the privileged number that they tell: tilt [rad] and rate of turning [rad/s]."""
+    """Heads by the privileged number that they predict: tilt [rad] and rate of turning [rad/s]."""
 
 
 class StallSpec(SpecModel):
@@ -84,35 +84,35 @@ class StallSpec(SpecModel):
     within: Time = 2.0
     """Time for a further turn [s]."""
     turn: Angle = 0.1
-    """By how much it has to turn in that time, the right way [rad]."""
+    """Angle that it must turn in that time, the right way [rad]."""
 
 
 class ScrewdriverSpec(TaskSpec, ProgressSpec):
     """Spin a screwdriver about its long axis."""
 
     train: Train = Train()
-    """How a policy is learned: `tgdsl train`."""
+    """Training of a policy: `tgdsl train`."""
     distill: Distill = Distill()
-    """How students are taught by a policy that is there: `tgdsl distill`."""
+    """Training of students from a trained policy: `tgdsl distill`."""
 
     episode: Time = 20.0
     """Duration of an episode [s]."""
     grasps: GraspSpec = GraspSpec()
-    """How the grasps are sampled that episodes begin from."""
+    """Sampling of the grasps that episodes begin with."""
     tip: str = "tip"
     """The scene's site at the tip."""
     max_spin: Positive = 6.0
-    """ω_max: what is faster pays no more [rad/s]."""
+    """ω_max: upper bound of the rate [rad/s]."""
     hold: HoldSpec = HoldSpec()
-    """What progress pays while the object coasts; by default as much as while it is held."""
+    """Reward of progress while the object coasts; by default the same as while it is held."""
     free_distance: PositiveLength = 0.02
-    """r: closer to where it stands upright, the handle costs nothing [m]."""
+    """r: distance of the handle from its upright position without a penalty [m]."""
     drop_tilt: Angle = 0.8
-    """With a larger tilt the screwdriver has fallen over [rad]."""
+    """Tilt above which the screwdriver has fallen over [rad]."""
     engagement: PositiveLength = 0.005
-    """Further from where it was, the tip is out of the screw [m]."""
+    """Distance from its start beyond which the tip is out of the screw [m]."""
     stall: StallSpec | None = None
-    """When an episode ends for good as the screwdriver does not turn any more; null: never."""
+    """Terminates episodes in which the screwdriver stops turning; null: never."""
 
 
 class Screwdriver(terms.HandTask[ScrewdriverSpec]):
@@ -158,7 +158,7 @@ class Screwdriver(terms.HandTask[ScrewdriverSpec]):
     effort = terms.Effort.of_task(0.0)
 
     def __init__(self, spec: ScrewdriverSpec, setup: Setup):
-        """Begin with all screwdrivers upright, as the keyframe has them; raise `SimulationError` if there are no grasps."""
+        """Begin with all screwdrivers upright, as in the keyframe; raise `SimulationError` if there are no grasps."""
         super().__init__(spec, setup)
         if setup.grasps is None:
             raise SimulationError("this task begins with grasps, and there are none")
@@ -170,7 +170,10 @@ class Screwdriver(terms.HandTask[ScrewdriverSpec]):
         self.quat, self.start_joints = self.keep("quat", 4), self.keep("start_joints", len(setup.actuators.names))
         self.rate, self.tilt, self.turned = self.keep("rate"), self.keep("tilt"), self.keep("turned")
         if spec.stall:
-            self.angle, self.mark = self.keep("angle"), self.keep("mark")  # Σ Δψ, and that after the last turn that counted
+            self.angle, self.mark = (
+                self.keep("angle"),
+                self.keep("mark"),
+            )  # Σ Δψ, and its value at the last turn that counted
             self.since = self.keep("since", dtype=torch.int64)  # control steps since then
         self.parts = {
             "priv_obj_state": [groups.object_state(setup), groups.distances(setup)],
@@ -182,7 +185,7 @@ class Screwdriver(terms.HandTask[ScrewdriverSpec]):
         return Watch(sites=(spec.tip,))
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
-        """Begin with a grasp of each environment's own handle."""
+        """Begin with a grasp of each environment's handle."""
         drawn = self.grasps.draw(episode)
         qpos = drawn.values.get("qpos")
         assert isinstance(qpos, Tensor)
@@ -193,7 +196,7 @@ class Screwdriver(terms.HandTask[ScrewdriverSpec]):
         return Start(drawn.values, drawn.contacts)
 
     def advance(self, now: Now) -> None:
-        """Add up what the screwdriver has turned."""
+        """Accumulate the screwdriver's rotation."""
         quat = now.object.quat
         step = -rotations.twist(rotations.product(rotations.inverse(self.quat), quat), self.axis)
         self.rate.copy_(step / self.setup.control_step)
@@ -222,7 +225,7 @@ class Screwdriver(terms.HandTask[ScrewdriverSpec]):
         return {"object_tilt": self.tilt, "rotation_progress": self.rate}
 
     def score(self) -> Float[Tensor, " env"]:
-        """Return what was turned while upright, over the duration of a whole episode [rad/s]."""
+        """Return the angle turned while upright, over the duration of a whole episode [rad/s]."""
         return self.turned / self.spec.episode
 
     def _pay(self, now: Now) -> Float[Tensor, " env"]:
