@@ -276,12 +276,14 @@ def test_run_closes_a_hand_without_keyframes(here, tmp_path):
     code, out, said = here(tmp_path, "run", "hand.safetensors", "--seconds", "0.8", "--num-envs", "2", "--out", "closed")
     assert code == 0, said
     assert out.startswith(
-        "no keyframes rest and squeeze: the hand closes on `ball`, put between the fingers, weightless; 3 of 3 joints\n"
+        "no keyframes rest and squeeze: the hand closes on `ball`, put between the fingers, without gravity; 3 of 3 joints\n"
     )
     with np.load(tmp_path / "closed" / "readings.npz") as kept:
         forces = np.linalg.norm(kept["touch"][..., 1:], axis=-1)
         assert kept["ctrl"].shape == (len(forces), 3) and np.isfinite(forces).all()
         assert not forces[0].any() and ((forces[-1] > 0).sum(axis=-1) >= 2).all()
+    code, _, said = here(tmp_path, "run", "hand.safetensors", "--controls", "closed/readings.npz", "--out", "again")
+    assert code == 2 and "closed/readings.npz: its controls are of servos that `tgdsl run` added to close the hand" in said
 
 
 @pytest.mark.slow

@@ -157,12 +157,12 @@ def test_recorder_file(document, tmp_path, controls):
     for index in range(3):
         readings = {name: torch.from_numpy(values[index]).double().requires_grad_() for name, values in kept.items()}
         recorder.add(Step(index, 0.1 * (index + 1), readings, torch.full((4, 7), float(index))))
-    recorder.write(tmp_path / "r.npz", controls, Path("scene.yaml"))
+    recorder.write(tmp_path / "r.npz", controls, Path("scene.yaml"), ["a", "b"])
     with np.load(tmp_path / "r.npz", allow_pickle=False) as archive:
         found = dict(archive)
     units = {f"{name}:{part}" for name in kept for part in ("channels", "units")}
     places = {f"{name}:{part}" for name in kept for part in ("link", "body", "pos", "normal", "area")}
-    assert found.keys() == {"time", "ctrl", "qpos", "document", "touch", "touch/clean", "depth"} | units | places
+    assert found.keys() == {"time", "ctrl", "actuators", "qpos", "document", "touch", "touch/clean", "depth"} | units | places
     np.testing.assert_allclose(found["time"], [0.1, 0.2, 0.3])
     np.testing.assert_array_equal(found["ctrl"], controls)
     for name, values in kept.items():
@@ -184,7 +184,7 @@ def test_a_recording_of_bodies_says_which(document, tmp_path):
     touch = tgdsl.compile({**document, "sensors": sensors})
     recorder = Recorder(touch, 1, 1)
     recorder.add(Step(0, 0.1, {"solver": torch.zeros(1, 1, 4)}, torch.zeros(1, 7)))
-    recorder.write(tmp_path / "r.npz", np.zeros((1, 2)), Path("scene.yaml"))
+    recorder.write(tmp_path / "r.npz", np.zeros((1, 2)), Path("scene.yaml"), ["a", "b"])
     with np.load(tmp_path / "r.npz", allow_pickle=False) as found:
         assert found["solver:body"].tolist() == ["pad"]
         assert not {"solver:pos", "solver:link"} & set(found)
@@ -198,7 +198,7 @@ def test_a_recording_that_fails_leaves_nothing(document, tmp_path, monkeypatch):
 
     monkeypatch.setattr("os.replace", fail)
     with pytest.raises(OSError, match=r"no space"):
-        recorder.write(tmp_path / "r.npz", np.zeros((1, 2)), Path("scene.yaml"))
+        recorder.write(tmp_path / "r.npz", np.zeros((1, 2)), Path("scene.yaml"), ["a", "b"])
     assert not list(tmp_path.iterdir())
 
 

@@ -93,7 +93,7 @@ class Run:
     controls: args.OptionalFile = None
     """An .npz file with recorded controls, an array `ctrl` (step, actuator) or (step, env, actuator); default: keyframes."""
     num_envs: Annotated[int, tyro.conf.arg(aliases=["--envs"])] = 1
-    """Number of environments; the table and the picture show the first."""
+    """Number of environments; they differ by their controls alone. The table and the picture show the first."""
     substeps: args.OptionalInt = None
     """Physics steps per control step; default: the `substeps` of sensors that read blocks, or 5."""
     out: args.OutFolder = Path("out")
@@ -132,7 +132,8 @@ class Run:
             print(f"at the end {problem}: do they face it? A grid along [0, 0, -1] is on the side that faces +z")
         for name, problem in missed_loads(touch, readings).items():
             print(f"at the end {problem}: see {name}")
-        recorder.write(with_folder(record), controls, self.document)
+        names = [sim.model.actuator(i).name for i in range(sim.model.nu)]
+        recorder.write(with_folder(record), controls, self.document, names)
         print(f"readings: {record}")
         self._draw(touch, sim, readings, *pictures)
 

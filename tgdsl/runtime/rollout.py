@@ -23,7 +23,7 @@ from tgdsl.files.arrays import read_arrays
 from tgdsl.files.write import atomic_open
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
-from tgdsl.runtime.closing.closing import START, Closing, closing_of
+from tgdsl.runtime.closing.closing import SERVO, START, Closing, closing_of
 from tgdsl.runtime.simulators.machine import refuse_beyond_memory
 from tgdsl.runtime.simulators.model_ids import element_id
 from tgdsl.runtime.simulators.simulation import Simulation
@@ -126,11 +126,15 @@ def recorded_controls(path: Path) -> Controls:
     """Return the array `ctrl` of an `.npz` file, (step, actuator) or (step, env, actuator).
 
     Raises:
-        SimulationError: If the file cannot be read or holds no such array, or a number in it is not finite.
+        SimulationError: If the file cannot be read or holds no such array, a number in it is not finite, or they are of servos
+            that closed a hand.
     """
     arrays = read_arrays(path, expected := "an .npz file with an array `ctrl`", SimulationError)
     if "ctrl" not in arrays:
         raise SimulationError(f"{path}: expected {expected}: found {', '.join(arrays) or 'none'}")
+    if any(name.startswith(SERVO) for name in arrays.get("actuators", np.array([], dtype=str)).tolist()):
+        problem = "its controls are of servos that `tgdsl run` added to close the hand"
+        raise SimulationError(f"{path}: {problem}; expected controls of the scene's own actuators")
     controls = arrays["ctrl"]
     if controls.ndim not in (2, 3) or not len(controls) or not np.issubdtype(controls.dtype, np.floating):
         expected = "expected floats (step, actuator) or (step, env, actuator)"
@@ -217,11 +221,11 @@ def missed_loads(touch: TactileModule, readings: Mapping[str, Tensor]) -> dict[s
 class Recorder:
     """Keeps the readings of a rollout and writes them as one `.npz` file.
 
-    The file holds `time` (step,) [s], `ctrl` (step, …, actuator), MuJoCo's `qpos` (step, env, nq) after the step, the path of
-    the `document`, each reading by its name (step, env, taxel, channel) as float32, and its channels' names and units under
-    `<name>:channels` and `<name>:units`. Where its taxels are is under `<name>:link`, `<name>:body`, `<name>:pos` and
-    `<name>:normal` (frame of the body [m]) and `<name>:area` [m²]; of readings of bodies there is `<name>:body` alone, of those
-    with rows of their own the columns of `touch.rows[<name>]`.
+    The file holds `time` (step,) [s], `ctrl` (step, …, actuator), names of `actuators`, MuJoCo's `qpos` (step, env, nq) after
+    the step, the path of the `document`, each reading by its name (step, env, taxel, channel) as float32, and its channels'
+    names and units under `<name>:channels` and `<name>:units`. Where its taxels are is under `<name>:link`, `<name>:body`,
+    `<name>:pos` and `<name>:normal` (frame of the body [m]) and `<name>:area` [m²]; of readings of bodies there is
+    `<name>:body` alone, of those with rows of their own the columns of `touch.rows[<name>]`.
     """
 
     def __init__(self, touch: TactileModule, num_steps: int, num_envs: int):
@@ -240,9 +244,10 @@ class Recorder:
         for name, column in self._readings.items():
             column[step.index] = step.readings[name].detach().cpu().numpy()
 
-    def write(self, path: Path, controls: Controls, document: Path) -> None:
+    def write(self, path: Path, controls: Controls, document: Path, actuators: Sequence[str]) -> None:
         """Write the file; it appears whole or not at all. `tgdsl view` finds the scene again by the document or artefact."""
         arrays: dict[str, np.ndarray] = {"time": self._time, "ctrl": controls, **self._readings}
+        arrays["actuators"] = np.array(actuators, dtype=str)
         arrays |= {"qpos": np.array(self._qpos), "document": np.array(str(document.resolve()))}
         for output in self._outputs:
             arrays[f"{output.name}:channels"] = np.array(output.channels)

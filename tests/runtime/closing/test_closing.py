@@ -113,7 +113,7 @@ def test_a_gripper_presses_with_the_object_s_weight_and_its_arm_stays(tmp_path):
     """By virtual work a servo that both jaws follow gives each half its force; the arm's motor, at zero, bears nothing."""
     touch = module(tmp_path, "gripper.xml", GRIPPER)
     closing, sim, _ = closed(touch)
-    assert str(closing) == "the hand closes on `ball`, put between the fingers, weightless; 1 of 1 joints"
+    assert str(closing) == "the hand closes on `ball`, put between the fingers, without gravity; 1 of 1 joints"
     np.testing.assert_allclose(closing.place[:2], 0.0, atol=1e-9)  # midway between the jaws
     mass = float(sim.model.body("ball").mass[0])
     found = forces_on(sim, "ball")
@@ -167,7 +167,7 @@ def test_what_is_between_the_fingers_stays_there(tmp_path):
     )
     closing, _, load = closed(module(tmp_path, "gripper.xml", GRIPPER, {"egg": {"body": "egg"}}, text))
     assert closing.place is None
-    assert str(closing) == "the hand closes on `egg`, which stays where it is; 1 of 1 joints"
+    assert str(closing) == "the hand closes on `egg`, where the scene has it; 1 of 1 joints"
     np.testing.assert_allclose(closing.start[-7:-4], [0.002, 0.003, 0.435])
     assert (load[0] > 0).sum() == 2
 

@@ -194,7 +194,7 @@ def test_tables_and_pictures_are_of_links_alone(touch, tmp_path):
     lines = table(touch, readings)
     assert "dist" in lines[0] and "joint_pos" not in lines[0] and len(lines) == 4
     assert [axes.get_title(loc="left") for axes in drawing(touch, sim, readings).axes] == ["dist  ·  surface_distance"]
-    recorder.write(tmp_path / "readings.npz", CONTROLS[:2], Path("scene.yaml"))
+    recorder.write(tmp_path / "readings.npz", CONTROLS[:2], Path("scene.yaml"), ["a", "b"])
     with np.load(tmp_path / "readings.npz") as archive:
         assert (archive["joint_vel"][1, 0, :, 0] == readings["joint_vel"][0, :, 0].numpy()).all()
         assert archive["last_action:units"].tolist() == ["control"]

@@ -28,6 +28,7 @@ from tgdsl.scene.mujoco_warnings import muted_mujoco
 from tgdsl.scene.scene import SceneModels
 
 START = "tgdsl/open"  # the keyframe with the hand open
+SERVO = "tgdsl/servo/"  # begins the names of the actuators that close the hand
 SHARES = np.linspace(0.0, 1.0, 9)  # how far the hand is closed: where its tips are tried, and where touch is looked for
 TOWARD_PALM = (0.0, 0.2, 0.4, 0.6, -0.25, -0.5)  # how far from the tips' middle to the palm a place is tried
 OPPOSED = -0.3  # two links that touch an object oppose each other if the cosine between their directions is less than this
@@ -343,7 +344,7 @@ class Closing:
             tendon.stiffness, tendon.frictionloss = [0, 0, 0], 0.0
 
     def __str__(self) -> str:
-        where = "put between the fingers, weightless" if self.place is not None else "which stays where it is"
+        where = "put between the fingers, without gravity" if self.place is not None else "where the scene has it"
         return f"the hand closes on `{self.target}`, {where}; {len(self.servos)} of {self.num_joints} joints"
 
 
@@ -429,7 +430,7 @@ def _add_servo(spec: mujoco.MjSpec, servo: Servo) -> None:
     joint = spec.joint(servo.joint)
     _slacken(joint)
     joint.damping, joint.armature = [servo.damping, 0, 0], servo.armature
-    name, kind = f"tgdsl/{servo.joint}", mujoco.mjtTrn.mjTRN_JOINT
+    name, kind = f"{SERVO}{servo.joint}", mujoco.mjtTrn.mjTRN_JOINT
     actuator = spec.add_actuator(name=name, target=servo.joint, trntype=kind, group=NUM_GROUPS)
     # Nothing of the scene's own <default> for actuators: neither gear nor a range.
     actuator.gear, actuator.inheritrange = [1, 0, 0, 0, 0, 0], 0.0
