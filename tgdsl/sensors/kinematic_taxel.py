@@ -275,8 +275,8 @@ def forward(
         stretch = torch.minimum(torch.maximum(state.stretch + touch.depth - state.depth, -width), width)
         stretch = torch.where(touch.depth > 0, stretch, touch.depth)
         pressed, is_broken = (pressed + constants.loop_stiffness * stretch).clamp(min=0), touch.depth.isnan()
-        kept = (torch.where(is_broken, *pair) for pair in ((state.stretch, stretch), (state.depth, touch.depth)))
-        after = LoopState(*kept)  # after a pose that is not finite the loop goes on from the last finite depth
+        fields = (torch.where(is_broken, *pair) for pair in ((state.stretch, stretch), (state.depth, touch.depth)))
+        after = LoopState(*fields)  # after a pose that is not finite the loop goes on from the last finite depth
     if constants.member is not None and constants.body is not None:
         pressed, limit = _balanced(pressed, gathered[Contacts], constants.member, constants.body)
     if constants.friction_cone is not None:

@@ -104,7 +104,7 @@ class MicrophoneSpec(AnySensorSpec):
         return {} if self.body is None else {"body": self.body}
 
 
-TAPS, ORDER = 24, 6  # samples T that a value is made of, and coefficients of each tap's polynomial
+TAPS, ORDER = 24, 6  # samples T per interpolated value, and coefficients of each tap's polynomial
 PASS_BAND = 0.4  # frequency up to which values are exact, as a part of the sample rate
 LEAST_DELAY = TAPS // 2  # samples by which sound is late at the least: the filter looks as far ahead
 
@@ -127,8 +127,8 @@ def coefficients() -> Float[np.ndarray, "power tap"]:
     omega = 2 * np.pi * np.linspace(0.0, PASS_BAND, 49)
     powers = (fraction[:, None] - 0.5) ** np.arange(ORDER)
     heard = np.einsum("wk,dm->wdmk", np.exp(1j * np.outer(omega, taps)), powers).reshape(-1, ORDER * TAPS)
-    wanted = np.exp(1j * np.outer(omega, fraction)).reshape(-1)
-    rows, right = (np.concatenate([np.real(part), np.imag(part)]) for part in (heard, wanted))
+    ideal = np.exp(1j * np.outer(omega, fraction)).reshape(-1)
+    rows, right = (np.concatenate([np.real(part), np.imag(part)]) for part in (heard, ideal))
     return np.linalg.lstsq(rows, right, rcond=1e-12)[0].reshape(ORDER, TAPS)
 
 
@@ -138,20 +138,20 @@ def delayed(
     delay: Float[Tensor, "env row out"],
     coefficients: Float[Tensor, "power tap"],
 ) -> Float[Tensor, "env row out"]:
-    """Return samples as they were some time before given ones.
+    """Return samples delayed by a fraction of a sample.
 
     Args:
-        samples: All that is remembered, oldest first.
-        end: Which sample each value is before.
-        delay: By how many samples, from `LEAST_DELAY` up to what is remembered.
+        samples: The history, oldest first.
+        end: Index of the sample that each delay counts back from.
+        delay: Delay in samples, from `LEAST_DELAY` to the length of the history.
         coefficients: C.
     """
     whole = torch.ceil(delay)
     fraction = (whole - delay)[..., None] - 0.5
     first = end - whole.to(torch.int64) - (TAPS // 2 - 1)
     windows = samples.unfold(-1, TAPS, 1)
-    chosen = torch.gather(windows, 2, first[..., None].expand(*first.shape, TAPS))
-    parts = torch.matmul(chosen, coefficients.transpose(0, 1)).unbind(-1)
+    taps = torch.gather(windows, 2, first[..., None].expand(*first.shape, TAPS))
+    parts = torch.matmul(taps, coefficients.transpose(0, 1)).unbind(-1)
     value = parts[-1]
     for part in parts[-2::-1]:
         value = value * fraction[..., 0] + part
@@ -159,14 +159,14 @@ def delayed(
 
 
 def age_of_sound(away: Vec, length: Tensor) -> Float[Tensor, "env row"]:
-    """Return how long ago what is heard now was emitted, in steps; that of the last node if it is longer.
+    """Return the age of the sound that arrives now, in steps, at most the last node's age.
 
-    Retarded time: how long ago what is heard now was emitted, by sources and a microphone that move.
+    This is the retarded time of moving sources and a moving microphone:
 
         a = |m(t) − s(t − a)|/c                                                                   [s]
 
-    with m where the microphone is and s where the source was. Places are known at the instants of steps, Δt apart, and linear
-    in between. So of X_j = m(t) − s(t − jΔt), L = cΔt and the first j with |X_(j+1)| < (j+1) L,
+    with the microphone at m and the source at s. Positions are known at the ends of steps, Δt apart, and linear in between. So
+    with X_j = m(t) − s(t − jΔt), L = cΔt and the first j with |X_(j+1)| < (j+1) L,
 
         (j + b)² L² = |X_j + b D|²,   D = X_(j+1) − X_j,   a = (j + b) Δt,
 
@@ -185,12 +185,12 @@ def age_of_sound(away: Vec, length: Tensor) -> Float[Tensor, "env row"]:
     has_arrived = distance < number * length
     node = torch.where(has_arrived, number, last).amin(dim=1, keepdim=True) - 1
     first, second = (planes.vec(torch.gather(part, 1, node + i)[:, 0] for part in away) for i in (0, 1))
-    steps, own = node[:, 0].to(distance.dtype), torch.gather(distance, 1, node)[:, 0]
+    steps, node_distance = node[:, 0].to(distance.dtype), torch.gather(distance, 1, node)[:, 0]
     moved = planes.sub(second, first)
     # (L² − |D|²) b² + 2 half b + ahead = 0
     square = length * length - planes.dot(moved, moved)
     half = length * length * steps - planes.dot(first, moved)
-    ahead = (length * steps - own) * (length * steps + own)
+    ahead = (length * steps - node_distance) * (length * steps + node_distance)
     root = half.abs() + planes.safe_sqrt((half * half - square * ahead).clamp(min=0.0))
     is_none = root <= planes.tiny()
     b = torch.where(half >= 0, -ahead / torch.where(is_none, 1.0, root), root / torch.where(square > 0, square, 1.0))
@@ -200,30 +200,30 @@ def age_of_sound(away: Vec, length: Tensor) -> Float[Tensor, "env row"]:
 def reference(
     spec: MicrophoneSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return p (sample, 1, 1) [Pa], and what is remembered."""
-    found = gathered[Upstream]
-    made = np.concatenate([own[SAMPLES] for own in found.values()], axis=1)
-    place = np.concatenate([own[PLACE] for own in found.values()], axis=1)
+    """Return p (sample, 1, 1) [Pa], and the next state."""
+    sources = gathered[Upstream]
+    emitted = np.concatenate([source[SAMPLES] for source in sources.values()], axis=1)
+    place = np.concatenate([source[PLACE] for source in sources.values()], axis=1)
     listener = np.array(spec.pos) if spec.body is None else gathered[Places][0]
-    num, num_rows = made.shape
+    num, num_rows = emitted.shape
     num_nodes, room = state["path"].shape[1], state["history"].shape[1]
-    level = np.concatenate([np.full(own[SAMPLES].shape[1], spec.levels.get(name, 1.0)) for name, own in found.items()])
+    level = np.concatenate([np.full(source[SAMPLES].shape[1], spec.levels.get(name, 1.0)) for name, source in sources.items()])
     if context.is_first:
         track, history = np.repeat(place[None], num_nodes + 1, axis=0), np.zeros((room, num_rows))
     else:
         track, history = np.concatenate([place[None], state["track"][:-1]]), state["emitted"]
-    sound = np.concatenate([history, made])
+    sound = np.concatenate([history, emitted])
     far = spec.reach / spec.speed
     pressure, ages = np.zeros((num, 1, 1)), np.zeros(num_rows)
     for row in range(num_rows):
         ages[row] = reference_age(listener, track[:, :, row], context.dt, spec.speed)
-        before = ages[row] if context.is_first else state["ages"][row]
-        is_heard = [age <= far and age < num_nodes * context.dt for age in (before, ages[row])]
-        distances = [max(spec.speed * age, spec.nearest) for age in (before, ages[row])]
+        previous_age = ages[row] if context.is_first else state["ages"][row]
+        is_heard = [age <= far and age < num_nodes * context.dt for age in (previous_age, ages[row])]
+        distances = [max(spec.speed * age, spec.nearest) for age in (previous_age, ages[row])]
         gains = [level[row] / r**spec.falloff if heard else 0.0 for r, heard in zip(distances, is_heard, strict=True)]
         for k in range(1, num + 1):
             share = k / num
-            delay = (before + share * (ages[row] - before)) * num / context.dt
+            delay = (previous_age + share * (ages[row] - previous_age)) * num / context.dt
             delay = float(min(max(delay, LEAST_DELAY), room - TAPS // 2))
             value = interpolated(sound[:, row], room + k - 1 - delay)
             pressure[k - 1] += (gains[0] + share * (gains[1] - gains[0])) * value
@@ -232,7 +232,7 @@ def reference(
 
 
 def reference_age(listener: Float[np.ndarray, " 3"], track: Float[np.ndarray, "node 3"], dt: float, speed: float) -> float:
-    """Return how long ago a source emitted what is heard now [s], its places at the last steps being given, now first."""
+    """Return the age of the sound that arrives now [s]; `track` has the source's positions at the last steps, newest first."""
     from scipy.optimize import brentq
 
     def early(age: float) -> float:

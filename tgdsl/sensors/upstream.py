@@ -1,7 +1,7 @@
 """A kind's request to other sensors of its document, answered after those are evaluated.
 
 A kind that provides planes for others lists them in `Kind.provides`; `Lowered.provides` has the planes of one sensor, and
-`forward` returns them beside its channels. A kind that reads others puts an `Upstream` into `Lowered.upstream`, and names in
+`forward` returns them with its channels. A kind that reads others puts an `Upstream` into `Lowered.upstream`, and names in
 `Kind.reads` the field of its spec that has their names. At each call or substep the named sensors are evaluated first, once
 for all readers. The kind gets in `gathered[Upstream]` all planes that their `forward` returned at the same call or substep,
 before noise, rate and history, by the sensors' names. Users' readings stay the same.

@@ -111,23 +111,20 @@ UNKNOWN = 1e30  # steady load at the beginning of an episode [N]: no first load 
 def impulses(
     force: Load, constants: Constants, state: State, share: Float[Tensor, "env body object mode"] | None = None
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return the impulses that strike at the start of this step [N·s], and what is remembered.
+    """Return the impulses that strike at the start of this step [N·s], and the next state.
 
-    From the load of a pair at each physics step to the impulses that strike it.
-
-    A collision takes the solver one step or several, as its time step and its contacts' stiffness have it, but a stiff body
-    rings from all of its impulse. So what a load F exceeds a steady load F̄ by is summed up, and strikes at once when it no
-    longer grows:
+    The solver spreads a collision over one or more steps, depending on its time step and contact stiffness, but a stiff body
+    rings from the whole impulse. So the excess of the load F over a steady load F̄ is summed up, and strikes at once when it
+    no longer grows:
 
         A ← κA + (F − F̄)₊ Δt,   F̄ ← F + κ(F̄ − F),   κ = e^(−Δt/τ)                               [N·s], [N]
         J = A, and A ← 0, F̄ ← F, where (F − F̄)₊ Δt ≤ (1 − κ) A                                   [N·s]
 
-    A collision of the duration T ≪ τ strikes with its impulse ∫F dt, whatever the number of steps; a load that takes much
-    longer than τ to rise by ΔF, at the rate R, with R τ² alone; a steady one not at all. The first load of an episode counts as
-    steady.
+    A collision of duration T ≪ τ strikes with its impulse ∫F dt, whatever the number of steps. A load that rises at the rate R
+    for much longer than τ strikes with R τ² alone, and a steady load not at all. The first load of an episode counts as steady.
 
-    With mode shapes each mode i has an A_i of its own, which grows by s_i (F − F̄)₊ Δt with the mode's share s_i of what strikes
-    where the load acts, and is kept and passed on when A is: so it is weighted by where the load was when it grew.
+    With mode shapes each mode i has its own A_i, which grows by s_i (F − F̄)₊ Δt and strikes when A does. s_i is the mode's
+    share at the load's position, so each part of an impulse is weighted by where the load was when it grew.
 
     `model: force` collects nothing: its drive is the rise of the force in each step.
 
@@ -137,22 +134,22 @@ def impulses(
         force: F [N].
         constants: The sensor's.
         state: The memory.
-        share: Of each mode, s; the impulses are then those of each mode, (env, body, object, mode).
+        share: s of each mode; the impulses then have the axes (env, body, object, mode).
     """
-    above, kept = force - state["steady"], constants["kept"]
+    above, decay = force - state["steady"], constants["kept"]
     grown = above.clamp(min=0.0) * constants["step"]
     if "is_paper" in constants:
         return grown if share is None else grown[..., None] * share, {"steady": force}
     pending = state["pending"].clone()  # derivatives by constants look at it once the state has gone on
     is_over = grown <= constants["leaked"] * pending
     impulse = torch.where(is_over, pending, 0.0 * grown)  # not-a-number strikes at once
-    after = torch.where(is_over, force, torch.addcmul(force, above, kept, value=-1))
-    new = {"pending": torch.where(is_over, 0.0, torch.addcmul(grown, pending, kept)), "steady": after}
+    after = torch.where(is_over, force, torch.addcmul(force, above, decay, value=-1))
+    new = {"pending": torch.where(is_over, 0.0, torch.addcmul(grown, pending, decay)), "steady": after}
     if share is None:
         return impulse, new
-    own, each = grown[..., None] * share, state["weighted"].clone()
-    new["weighted"] = torch.where(is_over[..., None], 0.0, torch.addcmul(own, each, kept))
-    return torch.where(is_over[..., None], each, 0.0 * own), new
+    growth, each = grown[..., None] * share, state["weighted"].clone()
+    new["weighted"] = torch.where(is_over[..., None], 0.0, torch.addcmul(growth, each, decay))
+    return torch.where(is_over[..., None], each, 0.0 * growth), new
 
 
 def rises(
@@ -162,14 +159,14 @@ def rises(
     state: State,
     share: Float[Tensor, "env body object mode"] | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return by how much the force on each row rises in this step (env, row, *mode) [N], and what is remembered.
+    """Return by how much the force on each row rises in this step (env, row, *mode) [N], and the next state.
 
     Args:
         force: F [N].
         context: When.
         constants: The sensor's.
         state: The memory.
-        share: Of each mode, s.
+        share: s of each mode.
     """
     load = of_rows(force if share is None else force[..., None] * share, constants)
     is_first = context.is_first.view(-1, *[1] * (load.ndim - 1))
@@ -189,48 +186,46 @@ def tables(shapes: Sequence[ModeShapes], num_modes: int) -> dict[str, np.ndarray
         shapes: Mode shapes of each row.
         num_modes: Modes of the row with most.
     """
-    most = max(own.value.shape[2] for own in shapes)
-    kept: dict[bytes, int] = {}
+    most = max(shape.value.shape[2] for shape in shapes)
+    offsets: dict[bytes, int] = {}
     blocks: list[np.ndarray] = []
     first, owner = np.zeros(len(shapes), np.int64), np.zeros((len(shapes), most, num_modes))
-    for row, own in enumerate(shapes):
-        value = np.zeros((len(own.value), 3, most), np.float32)
-        value[:, :, : own.value.shape[2]] = own.value
+    for row, shape in enumerate(shapes):
+        value = np.zeros((len(shape.value), 3, most), np.float32)
+        value[:, :, : shape.value.shape[2]] = shape.value
         key = value.tobytes()
-        if key not in kept:
-            kept[key] = sum(map(len, blocks))
+        if key not in offsets:
+            offsets[key] = sum(map(len, blocks))
             blocks.append(value.reshape(len(value), -1))
-        first[row] = kept[key]
-        owner[row, np.arange(len(own.owner)), own.owner] = 1.0
+        first[row] = offsets[key]
+        owner[row, np.arange(len(shape.owner)), shape.owner] = 1.0
     result = {
         "shape_value": np.concatenate(blocks),
         "shape_first": first,
-        "shape_num": np.stack([own.num for own in shapes]),
-        "shape_axes": np.stack([own.axes for own in shapes]),
-        "shape_low": np.stack([own.low for own in shapes]),
-        "shape_rate": np.stack([1.0 / own.step for own in shapes]),
+        "shape_num": np.stack([shape.num for shape in shapes]),
+        "shape_axes": np.stack([shape.axes for shape in shapes]),
+        "shape_low": np.stack([shape.low for shape in shapes]),
+        "shape_rate": np.stack([1.0 / shape.step for shape in shapes]),
     }
     # Without any that are one, field i is mode i.
     return result if (owner.sum(axis=1) <= 1).all() else result | {"shape_owner": owner}
 
 
 def shares(center: Vec, along: Vec, constants: Constants) -> Float[Tensor, "env body object mode"]:
-    """Return the share of each mode of what rings; 0 where nothing touches, as `along` is 0 there.
-
-    By how much more or less than by its gain each mode is struck, from where a contact is and which way it presses.
+    """Return each mode's share s, the factor on its gain at a contact; 0 where nothing touches, since `along` is 0 there.
 
         s_i = Σ_k w_k φ_i(node k) · n,   or √(Σ_f (…)²) over the fields f of modes that symmetry makes one
 
     with the eight nodes around the centre of a pair's contacts on the grid of the body's mode shapes, trilinear weights w, and
-    the mean normal n of the contacts, weighted by their forces, into the body. Both are in the body's frame; mode shapes φ are
-    over the root mean square of what is normal to the surface, so that s² is 1 in the mean over it. Beyond the grid's box φ is
-    that of its nearest point.
+    the mean normal n of the contacts, weighted by their forces, into the body. Both are in the body's frame. Mode shapes φ are
+    divided by the root mean square of their normal component, so the mean of s² over the surface is 1. Outside the grid's box
+    φ has its value at the box's nearest point.
 
-    Shapes: `env` environments, `body` bodies that carry the sensor, `object` felt objects, `row` those of them that ring,
+    Shapes: `env` environments, `body` bodies that carry the sensor, `object` felt objects, `row` ringing bodies or objects,
     `node` nodes of all grids, `mode` modes of the row with most, `field` fields of the row with most.
 
     Args:
-        center: Centre of the contacts, (env, body, object), in the frame of what rings [m].
+        center: Centre of the contacts, (env, body, object), in the ringing body's frame [m].
         along: Their mean normal.
         constants: The sensor's.
     """
@@ -247,20 +242,20 @@ def shares(center: Vec, along: Vec, constants: Constants) -> Float[Tensor, "env 
         weights.append((1.0 - (at - cell), at - cell))
         stride = num[..., 2] * num[..., 1] if i == 0 else num[..., 2] if i == 1 else 1
         node = node + cell * stride
-    found = None
+    interpolated = None
     for x, y, z in product(range(2), repeat=3):
         corner = constants["shape_value"][node + (x * num[..., 1] + y) * num[..., 2] + z]
         part = (weights[0][x] * weights[1][y] * weights[2][z])[..., None] * corner
-        found = part if found is None else found + part
-    assert found is not None
-    fields = sum(n[..., None] * own for n, own in zip(turned, found.chunk(3, dim=-1), strict=True))
+        interpolated = part if interpolated is None else interpolated + part
+    assert interpolated is not None
+    fields = sum(n[..., None] * component for n, component in zip(turned, interpolated.chunk(3, dim=-1), strict=True))
     assert isinstance(fields, Tensor)
     return _of_modes(fields, constants["shape_owner"].unsqueeze(dim)) if "shape_owner" in constants else fields
 
 
 def _of_modes(fields: Tensor, owner: Tensor) -> Tensor:
-    own = fields[..., None] * owner
-    return torch.where(owner.sum(dim=-2) > 1, planes.safe_sqrt((own * own).sum(dim=-2)), own.sum(dim=-2))
+    by_mode = fields[..., None] * owner
+    return torch.where(owner.sum(dim=-2) > 1, planes.safe_sqrt((by_mode * by_mode).sum(dim=-2)), by_mode.sum(dim=-2))
 
 
 def lower(spec: ContactAudioSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
@@ -291,15 +286,15 @@ def lower(spec: ContactAudioSpec, layout: Layout, surface_of: SurfaceOf) -> Lowe
         unit = "dB" if spec.scale == "decibel" else "m²/s²"
         channels = tuple(Channel(f"band_{middle(number):.0f}", unit) for number in modes.bands)
     num_modes, pairs = modes.frequency.shape[1], (len(layout.bodies), len(spec.feels))
-    own = (num_modes,) if modes.shapes else ()
+    per_mode = (num_modes,) if modes.shapes else ()
     state = {"phasors": Memory(shape=(rows.size, 2 * num_modes))}
     if spec.model == "force":
-        state["load"] = Memory(shape=(rows.size, *own))
+        state["load"] = Memory(shape=(rows.size, *per_mode))
     else:
         state["steady"] = Memory(UNKNOWN, pairs)
     if spec.model == "physical":
         state["pending"] = Memory(shape=pairs)
-        state |= {"weighted": Memory(shape=(*pairs, *own))} if own else {}
+        state |= {"weighted": Memory(shape=(*pairs, *per_mode))} if per_mode else {}
     is_heard, loads = spec.outputs == "samples", Loads(spec.feels, slots=spec.slots, of=spec.of, has_center=bool(modes.shapes))
     return Lowered(
         channels=channels,
@@ -344,12 +339,12 @@ def forward(gathered: Gathered, context: Context, constants: Constants, state: S
     new["phasors"] = after = torch.nn.functional.hardshrink(after, least())
     if "heard" in constants:  # environments last: libraries multiply few rows by many columns faster
         parts = torch.cat([phasors, drive if drive.ndim == 3 else drive[..., None]], dim=-1).permute(1, 2, 0)
-        made = torch.bmm(constants["heard"].transpose(1, 2), parts).permute(2, 0, 1)
+        signal = torch.bmm(constants["heard"].transpose(1, 2), parts).permute(2, 0, 1)
         for n, (size, slot) in enumerate(grains):
-            own = size[..., None] * constants["grain_heard"][n][slot, row]
-            made = made + (own.sum(dim=2) if size.ndim == 3 else own)
-        made = made.transpose(1, 2)
-        return {"signal": made[:, :, None], SAMPLES: radiated() * made, PLACE: torch.stack(gathered[Places], dim=1)}, new
+            grain = size[..., None] * constants["grain_heard"][n][slot, row]
+            signal = signal + (grain.sum(dim=2) if size.ndim == 3 else grain)
+        signal = signal.transpose(1, 2)
+        return {"signal": signal[:, :, None], SAMPLES: radiated() * signal, PLACE: torch.stack(gathered[Places], dim=1)}, new
     energy = torch.bmm((after * after).transpose(0, 1), constants["energy"]).permute(1, 2, 0)
     return {"signal": _level(energy) if "is_decibel" in constants else energy}, new
 
@@ -360,7 +355,7 @@ def _turned(phasors: Tensor, drive: Tensor, turn: Tensor, constants: Constants) 
     along, across = turn.unbind()
     crossed = phasors.roll(phasors.shape[-1] // 2, dims=-1)
     after = torch.addcmul(phasors * along, crossed, across)
-    # Eager, tensors that are alike are multiplied faster than those that broadcast.
+    # Eager multiplication of equal shapes is faster than broadcasting.
     spread = torch.cat([drive, drive], dim=-1) if drive.ndim == 3 else drive[..., None].expand_as(after).contiguous()
     return torch.addcmul(after, spread, constants["driven"])
 

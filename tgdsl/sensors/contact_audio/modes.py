@@ -1,14 +1,14 @@
-"""A step of the modes, and a block of samples as one matrix: what of it depends on the time step, in float64.
+"""A step of the modes, and a block of samples as one matrix; constants that depend on the time step, in float64.
 
     heard = Hᵀ (Re z, Im z, u) + Σ_n ξ_n h(t_n),   z′ = p z + b u + Σ_n ξ_n e(t_n)
 
-with the phasors z of the modes at the start of a step [N·s] and what drives them in it: u, an impulse at its start [N·s], or
-with `model: force` the rise of the force [N], and `GRAINS` impulses of noise ξ_n [N·s], each at one of `SLOTS` times t_n of its
-part of the step. H and h hold the samples' sines, p, b and e what is left of phasors and drives at the end. All are exact,
-whatever the step. A phasor that is turned by the same rounded
-factor at every step drifts by 3e-8 a step. So in float32 p is rounded down at some steps and up at others, such that its mean
-is exact: up at step n where the fractional part of n (√5 − 1)/2 is below the share of a unit in the last place by which it is
-above the lower number. What is left are roundings that do not add up.
+with the phasors z of the modes at the start of a step [N·s] and their drives: u, an impulse at the start [N·s], or with
+`model: force` the rise of the force [N]; and `GRAINS` noise impulses ξ_n [N·s], each at one of `SLOTS` times t_n of its part of
+the step. H and h hold the samples' sines; p, b and e carry phasors and drives to the step's end. All are exact for any step.
+
+A phasor that is turned by the same rounded factor at every step drifts by 3e-8 a step. So in float32 p alternates between its
+two neighbours such that its mean is exact: it is rounded up at step n where the fractional part of n (√5 − 1)/2 is below p's
+distance from the lower neighbour, in units in the last place. The remaining rounding errors do not add up.
 
 Shapes: `row` bodies that ring, `mode` modes of the one with most, `part` real and imaginary part, `both` the real parts of all
 modes, then their imaginary ones, `sample` samples of a block, `band` bands, `grain` impulses of noise, `slot` times of each.
@@ -49,7 +49,7 @@ class ModeSpec(SpecModel):
     decay: Positive
     """Rate at which its amplitude decays, d [1/s]; it falls by 60 dB in 6.91/d."""
     gain: Number = 1.0
-    """Amplitude of what is heard per impulse, g [1/kg]."""
+    """Amplitude of the sound per impulse, g [1/kg]."""
 
 
 ListedModes = Annotated[tuple[ModeSpec, ...], Field(min_length=1)]
@@ -61,7 +61,7 @@ ModesField = Annotated[
         json_schema_input_type=str | ListedModes | ShapeModes,
     ),
 ]
-"""What a user may write for the modes of a body: a list of them, `{material: steel, …}` for those of its shape, or `steel`."""
+"""The modes of a body as a user writes them: a list, or `{material: steel, …}` or `steel` for modes computed from its shape."""
 
 
 class ContactAudioSpec(ProbeSpec):
@@ -72,7 +72,7 @@ class ContactAudioSpec(ProbeSpec):
     of: Literal["link", "object"] = "link"
     """Whose bodies ring: the links of the sensor, struck by the objects it feels, or these objects, struck by the links."""
     modes: ModesField
-    """Modes of what rings: a list of frequency, decay and gain; `{material: steel}` or `steel` for those of its shape."""
+    """Modes of a body: a list of frequency, decay and gain; or `{material: steel}` or `steel`, computed from its shape."""
     bodies: dict[str, ModesField] = {}
     """Other modes, by names of links (of objects with `of: object`) or shell wildcards; the first that matches counts."""
     gains: Literal["mean", "contact"] = "mean"
@@ -83,7 +83,7 @@ class ContactAudioSpec(ProbeSpec):
     substeps: Annotated[StrictInt, Field(ge=1)] = 1
     """Physics steps per call: a reading holds the blocks of all of them, one after the other."""
     timestep: Annotated[Time | None, Usual("time", low=1e-5, high=0.1)] = None
-    """Time that a physics step takes [s]; default: that of the scene."""
+    """Duration of a physics step [s]; default: the scene's time step."""
     settling: Annotated[Time, Usual("time", low=1e-4, high=1.0)] = 0.02
     """Time after which a load counts as steady, τ [s]: a slower press makes no sound. For `model: physical` alone."""
     loudest: Annotated[StrictInt, Field(ge=1)] | None = None
@@ -114,11 +114,11 @@ class ContactAudioSpec(ProbeSpec):
 def alternatives(spec: ContactAudioSpec) -> list[Alternative]:
     """Return fewer samples, fewer modes, all modes, and twice as many samples.
 
-    Samples at common times are the same whatever their number, but for the modes that it holds. Of the paper's response they
-    are not, and so not compared.
+    Samples at common times are equal for any number of samples, except that the sample rate limits the audible modes. With the
+    paper's response they are not, so they are not compared.
     """
-    given = [spec.modes, *spec.bodies.values()]
-    most = max(own.count if isinstance(own, ShapeModes) else len(own) for own in given)
+    fields = [spec.modes, *spec.bodies.values()]
+    most = max(field.count if isinstance(field, ShapeModes) else len(field) for field in fields)
     few = sorted({num for num in (1, most // 4, most // 2) if 0 < num < most})
     modes = [Alternative("the loudest mode" if num == 1 else f"the loudest {num} modes", {"loudest": num}) for num in few]
     modes.append(Alternative("all modes", {"loudest": None}))
@@ -132,9 +132,7 @@ def alternatives(spec: ContactAudioSpec) -> list[Alternative]:
 
 
 def numbers(frequency: np.ndarray) -> np.ndarray:
-    """Return the number of the band that each frequency is in; of 0 Hz that of none.
-
-    Third octaves: which band each mode is in.
+    """Return the number of each frequency's third-octave band; 0 Hz, padding, counts as 1 Hz.
 
         f_n = 1000 · 10^(n/10) Hz,   edges f_n · 10^(∓1/20)
 
@@ -144,9 +142,9 @@ def numbers(frequency: np.ndarray) -> np.ndarray:
 
 
 def band_numbers(frequency: Float[np.ndarray, " mode"]) -> list[int]:
-    """Return the bands from that of the lowest mode to that of the highest."""
-    own = numbers(frequency)
-    return list(range(int(own.min()), int(own.max()) + 1))
+    """Return all bands from the lowest mode's to the highest mode's."""
+    bands = numbers(frequency)
+    return list(range(int(bands.min()), int(bands.max()) + 1))
 
 
 def middle(number: int) -> float:
@@ -202,12 +200,12 @@ def radiated() -> float:
 
 
 def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
-    """Return what of a sensor's constants depends on the time step [s].
+    """Return the constants of a sensor that depend on the time step [s].
 
     Args:
         constants: `frequency` [Hz], `decay` [1/s], `gain` [1/kg], each (row, mode), 0 where a row has fewer; `samples`;
-            `settling` [s]; `scrape` [kg]; `is_paper` of the paper's response; `is_force` where the force drives; `band` (row,
-            mode, band) of bands; `shape_value` where each mode has a drive of its own.
+            `settling` [s]; `scrape` [kg]; `is_paper` for the paper's response; `is_force` where the force drives; `band` (row,
+            mode, band) for bands; `shape_value` where each mode has its own drive.
         step: The time step.
     """
     samples, scrape = int(constants["samples"]), float(constants["scrape"])
@@ -232,12 +230,12 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
         square = np.where(is_heard, rate, 1.0)[..., None] ** 2
         return np.where(is_heard[..., None], np.expm1(rate[..., None] * time) / (square * step), 0.0)
 
-    kept = math.exp(-step / float(constants["settling"]))
+    retained = math.exp(-step / float(constants["settling"]))
     turn = factors(np.array(step))
     added = struck(np.array([step]))[..., 0]
     result = {
-        "kept": np.asarray(kept),
-        "leaked": np.asarray(1.0 - kept),
+        "kept": np.asarray(retained),
+        "leaked": np.asarray(1.0 - retained),
         "step": np.asarray(step),
         "driven": np.concatenate([np.real(added), np.imag(added)], axis=1),
         **{name: _by_parts(name, part) for name, part in _rounded("turn", np.stack([np.real(turn), np.imag(turn)])).items()},
@@ -254,8 +252,8 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
     parts = [np.real(free), -np.imag(free), heard if has_each else heard.sum(axis=1, keepdims=True)]
     result["heard"] = np.concatenate(parts, axis=1)
     if scrape > 0:
-        own = np.real((seen * begun)[..., None, None, None] * factors(times - arrival[..., None])).transpose(2, 3, 0, 1, 4)
-        result["grain_heard"] = own if has_each else own.sum(axis=3)
+        response = np.real((seen * begun)[..., None, None, None] * factors(times - arrival[..., None])).transpose(2, 3, 0, 1, 4)
+        result["grain_heard"] = response if has_each else response.sum(axis=3)
     return result
 
 
@@ -292,15 +290,15 @@ SurfaceByName = Callable[[str], Surface]  # returns the surface of something tha
 
 
 class Ringing(NamedTuple):
-    """The modes of all rows that are computed; those that a row has fewer of than another are 0."""
+    """The computed modes of all rows, padded with zeros."""
 
     frequency: Float[np.ndarray, "row mode"]  # [Hz]
     decay: Float[np.ndarray, "row mode"]  # [1/s]
     gain: Float[np.ndarray, "row mode"]  # [1/kg]
-    # numbers of the third octaves from the lowest mode that is heard to the highest, whether computed or not
+    # numbers of the third octaves from the lowest audible mode to the highest, whether computed or not
     bands: Sequence[int]
-    notes: tuple[str, ...]  # what was left out, and why; and how exact mode shapes are, if those are wanted
-    shapes: tuple[ModeShapes, ...] = ()  # mode shapes of each row; none if they are not wanted
+    notes: tuple[str, ...]  # omitted modes with the reason, and the error of the mode shapes if there are any
+    shapes: tuple[ModeShapes, ...] = ()  # mode shapes of each row; empty with `gains: mean`
 
 
 def axis_of(spec: ContactAudioSpec, layout: Layout) -> Axis:
@@ -309,11 +307,11 @@ def axis_of(spec: ContactAudioSpec, layout: Layout) -> Axis:
 
 
 def names_of(spec: ContactAudioSpec, layout: Layout) -> list[tuple[str, tuple[str, ...]]]:
-    """Return of each row the name of its link or object, and all that it can be chosen by."""
+    """Return for each row the name of its link or object, and all names that select it."""
     if spec.of == "object":
         return [(name, (name,)) for name in spec.feels]
-    own = [[link.name for link in layout.links if link.body == body] for body in layout.bodies]
-    return [(names[0], (*names, body)) for names, body in zip(own, layout.bodies, strict=True)]
+    link_names = [[link.name for link in layout.links if link.body == body] for body in layout.bodies]
+    return [(names[0], (*names, body)) for names, body in zip(link_names, layout.bodies, strict=True)]
 
 
 def ringing(
@@ -339,7 +337,7 @@ def ringing(
             raise LowerError(problem, field="bodies", hint=f"it has {listed([name for name, _ in rows])}")
     below, each, notes = highest(spec.samples, step), [], []
     for name, names in rows:
-        modes = _modes_of(_given(spec, names), name, surface, below, progress)
+        modes = _modes_of(_modes_field(spec, names), name, surface, below, progress)
         is_heard = modes.frequency <= below * (1 + 1e-12)
         if not is_heard.any():
             raise _unheard(name, modes, spec, step)
@@ -357,8 +355,8 @@ def ringing(
     frequency, decay, gain = np.zeros((3, len(rows), most))
     for i, (modes, is_kept) in enumerate(each):
         count = int(is_kept.sum())
-        for table, own in ((frequency, modes.frequency), (decay, modes.decay), (gain, modes.gain)):
-            table[i, :count] = own[is_kept]
+        for table, values in ((frequency, modes.frequency), (decay, modes.decay), (gain, modes.gain)):
+            table[i, :count] = values[is_kept]
     shapes = []
     for (name, _), (modes, is_kept) in zip(rows, each, strict=True):
         if spec.gains == "contact" and modes.shapes is not None:
@@ -368,7 +366,7 @@ def ringing(
 
 
 def _loudest(modes: Modes, is_heard: np.ndarray, count: int | None) -> np.ndarray:
-    """Return which modes are computed: of those that are heard the ones that ring with most energy, ∫s² dt = g²/4d of f ≫ d."""
+    """Return which modes are computed: the audible modes with most energy, ∫s² dt = g²/4d for f ≫ d."""
     if count is None or count >= is_heard.sum():
         return is_heard
     energy = np.where(is_heard, modes.gain**2 / modes.decay, -1.0)
@@ -382,14 +380,14 @@ def _describe(shapes: ModeShapes) -> str:
     return f"mode shapes on {num} nodes; interpolated within {shapes.error.max():.1%} of a mode's mean on the surface"
 
 
-def _given(spec: ContactAudioSpec, names: tuple[str, ...]) -> ModesField:
-    own = (modes for pattern, modes in spec.bodies.items() if any(fnmatchcase(name, pattern) for name in names))
-    return next(own, spec.modes)
+def _modes_field(spec: ContactAudioSpec, names: tuple[str, ...]) -> ModesField:
+    matches = (modes for pattern, modes in spec.bodies.items() if any(fnmatchcase(name, pattern) for name in names))
+    return next(matches, spec.modes)
 
 
 def _dropped(frequency: np.ndarray) -> str:
-    shown = listed([f"{own:.5g} Hz" for own in frequency.tolist()], 8)
-    return f"{'a mode is' if len(frequency) == 1 else 'modes are'} left out, {shown}"
+    frequencies = listed([f"{value:.5g} Hz" for value in frequency.tolist()], 8)
+    return f"{'a mode is' if len(frequency) == 1 else 'modes are'} left out, {frequencies}"
 
 
 def _unheard(name: str, modes: Modes, spec: ContactAudioSpec, step: float) -> LowerError:

@@ -37,9 +37,9 @@ Strikes = list[tuple[float, float]]  # when each impulse acts after the start of
 def reference(
     spec: ContactAudioSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> ReferenceAnswer:
-    """Return the samples of one step (sample, row, 1) [m/s], or the energies of its bands (row, band); and what is kept.
+    """Return the samples of one step (sample, row, 1) [m/s], or the energies of its bands (row, band); and the next state.
 
-    Of samples there is also what a microphone hears.
+    Samples come with the planes that a microphone reads.
     """
     loads, step = gathered[Loads], context.dt
     modes = ringing(spec, layout, spec.timestep or step, _no_surface)
@@ -50,11 +50,11 @@ def reference(
         struck = load - (load if context.is_first else state["load"].reshape(load.shape))
         after = {"load": load if spec.gains == "contact" else load[:, 0]}
     else:
-        before = loads.force if context.is_first else state["steady"]
-        pending = state.get("pending", np.zeros_like(before))
+        last_steady = loads.force if context.is_first else state["steady"]
+        pending = state.get("pending", np.zeros_like(last_steady))
         weighted = state.get("weighted", np.zeros_like(share) if is_paper or spec.gains == "contact" else pending[..., None])
-        own = (before, pending, weighted)
-        impulse, steady, pending, weighted = reference_impulses(loads.force, own, share, step, spec.settling, is_paper)
+        memory = (last_steady, pending, weighted)
+        impulse, steady, pending, weighted = reference_impulses(loads.force, memory, share, step, spec.settling, is_paper)
         struck = impulse.sum(axis=axis)
         after = {"steady": steady} | ({} if is_paper else {"pending": pending})
         after |= {"weighted": weighted} if spec.gains == "contact" and not is_paper else {}
@@ -71,12 +71,12 @@ def reference(
             if not 0 < frequency <= below * (1 + 1e-12):
                 phasors[row, [m, half + m]] = 0.0
                 continue
-            rate, before = complex(-decay, 2 * math.pi * frequency), complex(phasors[row, m], phasors[row, half + m])
+            rate, phasor = complex(-decay, 2 * math.pi * frequency), complex(phasors[row, m], phasors[row, half + m])
             if is_force:
-                samples, last = _driven(rate, before, drive, strikes, spec.samples, step)
+                samples, last = _driven(rate, phasor, drive, strikes, spec.samples, step)
             else:
                 strikes = [(step / spec.samples if is_paper else 0.0, drive), *strikes]
-                samples, last = _ring(rate, before, strikes, spec.samples, step, is_paper)
+                samples, last = _ring(rate, phasor, strikes, spec.samples, step, is_paper)
             heard[:, row] += gain * samples
             phasors[row, [m, half + m]] = [part if abs(part) > least() else 0.0 for part in (last.real, last.imag)]
             amplitude[row, m] = gain * abs(complex(phasors[row, m], phasors[row, half + m]))
@@ -93,13 +93,13 @@ def _shares(spec: ContactAudioSpec, modes: Ringing, loads: PairLoads) -> Float[n
     result = np.zeros((*loads.force.shape, modes.frequency.shape[1]))
     for b, o in np.ndindex(loads.force.shape):
         shapes = modes.shapes[b if spec.of == "link" else o]
-        own = shapes.share(loads.center[b, o][None], loads.along[b, o][None])[0]
-        result[b, o, : len(own)] = own
+        share = shapes.share(loads.center[b, o][None], loads.along[b, o][None])[0]
+        result[b, o, : len(share)] = share
     return result
 
 
 def _no_surface(name: str) -> Surface:
-    raise NotImplementedError(f"the reference of contact audio knows listed modes alone, not those of the shape of {name}")
+    raise NotImplementedError(f"the reference of contact audio needs listed modes, not modes from the shape of {name}")
 
 
 def _noise(spec: ContactAudioSpec, context: ReferenceContext, row: int, num_rows: int, rubbed: float) -> Strikes:
@@ -149,23 +149,23 @@ def _two_pole(
     """Return y[k] = a₁ y[k−1] − a₂ y[k−2] + u[k], and the phasor whose imaginary part has the last two as its last values."""
     pole = np.exp(rate * step / samples)
     first, second = 2 * pole.real, abs(pole) ** 2
-    last, before = phasor.imag, (phasor / pole).imag
+    last, previous = phasor.imag, (phasor / pole).imag
     results = []
     for k in range(samples):
         struck = sum(u for time, u in strikes if abs(time - (k + 1) * step / samples) < 1e-9 * step)
-        last, before = first * last - second * before + struck, last
+        last, previous = first * last - second * previous + struck, last
         results.append(last)
     # y = Im z and y[k−1] = Im(z/p): two equations for Re z, with 1/p = p*/|p|².
-    real = (last * pole.real - before * second) / pole.imag
+    real = (last * pole.real - previous * second) / pole.imag
     return np.array(results), complex(real, last)
 
 
 def _bands(spec: ContactAudioSpec, modes: Ringing, amplitude: np.ndarray) -> np.ndarray:
     """Return ½ Σ (g |z|)² of the modes in each third octave (row, band) [m²/s²], or its level [dB]."""
     result = np.zeros((len(modes.frequency), len(modes.bands)))
-    for place, own in np.ndenumerate(modes.frequency):
+    for place, frequency in np.ndenumerate(modes.frequency):
         for b, number in enumerate(modes.bands):
-            if middle(number) * 10**-0.05 <= own < middle(number) * 10**0.05:
+            if middle(number) * 10**-0.05 <= frequency < middle(number) * 10**0.05:
                 result[place[0], b] += 0.5 * amplitude[place] ** 2
     return 10 * np.log10(1 + result / quiet()) if spec.scale == "decibel" else result
 
@@ -189,15 +189,15 @@ def reference_impulses(
         is_paper: Whether each rise of the force strikes by itself.
     """
     impulse, (steady, pending, weighted) = np.zeros_like(share), (part.copy() for part in before)
-    kept = np.exp(-step / settling)
+    decay = np.exp(-step / settling)
     for place, load in np.ndenumerate(force):
         grown = max(0.0, load - steady[place]) * step
         if is_paper:
             impulse[place], steady[place] = grown * share[place], load
-        elif grown <= (1 - kept) * pending[place]:
+        elif grown <= (1 - decay) * pending[place]:
             impulse[place], weighted[place] = weighted[place], 0.0
             pending[place], steady[place] = 0.0, load
         else:
-            weighted[place] = kept * weighted[place] + grown * share[place]
-            pending[place], steady[place] = kept * pending[place] + grown, load + kept * (steady[place] - load)
+            weighted[place] = decay * weighted[place] + grown * share[place]
+            pending[place], steady[place] = decay * pending[place] + grown, load + decay * (steady[place] - load)
     return impulse, steady, pending, weighted

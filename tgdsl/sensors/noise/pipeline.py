@@ -46,7 +46,7 @@ def more_knobs() -> tuple[type[Any], ...]:
 
 
 def knobs_of(knobs: frozenset[str]) -> frozenset[str]:
-    """Return the knobs of a kind, and those of stages that are not tgdsl's; none if the kind has none."""
+    """Return a kind's knobs and the knobs of users' stages; none if the kind has none."""
     return knobs.union(*(model.model_fields for model in more_knobs())) if knobs else knobs
 
 

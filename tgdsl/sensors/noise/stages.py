@@ -145,8 +145,8 @@ class Hysteresis(Stage):
         decay, ramp = materialised(torch.exp(-ratio)), materialised(ramp)
         lag = torch.where(now.age[..., None] == 0, 0.0, decay * memory.lag + ramp * (signal - memory.last))
         is_broken = signal.isnan()  # of a pose that is not finite: go on from the last finite signal
-        kept = (torch.where(is_broken, *pair) for pair in ((memory.lag, lag), (memory.last, signal)))
-        return signal + self.hysteresis_strength * lag, HysteresisMemory(*kept)
+        fields = (torch.where(is_broken, *pair) for pair in ((memory.lag, lag), (memory.last, signal)))
+        return signal + self.hysteresis_strength * lag, HysteresisMemory(*fields)
 
     @staticmethod
     def reference(signal: ReferenceSignal, call: ReferenceCall, memory: dict[str, Any]) -> ReferenceSignal:

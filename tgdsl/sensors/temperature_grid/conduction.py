@@ -1,4 +1,4 @@
-"""What cells show of heat that contacts bring within a step, while it is conducted on.
+"""How cells respond to the heat that contacts bring within a step, while it is conducted on.
 
 The heat that flows through a side of a patch in a step, H [J], and its flow at the end of the step times Δt, J [J], stand for
 its course in time: an impulse at the step's begin, a constant and a linear part,
@@ -11,7 +11,7 @@ decays by e^(−x) in the step shows at the step's end, and in its mean, over th
     e_a = (1 − σ, 6σ, −6σ) · (φ₀, φ₁, φ₂)/(1 + 2σ),   e_b = (σ − 1, 1 − 4σ, 6σ) · (φ₀, φ₁, φ₂)/(1 + 2σ)                   [1]
     m_a, m_b: the same of (φ₁, φ₂, φ₃),   φ₀ = e^(−x),   φ_k = (1/(k − 1)! − φ_(k−1))/x
 
-A flow that decays as e^(−zt), that of two bodies of one temperature each, has exactly
+A flow that decays as e^(−zt), as between two bodies of one temperature each, has exactly
 
     σ = (J₀ − z e^(−z))/(2 (Q − J₀)),   Q = 1 − e^(−z),   J₀ = 2 (Q/z − e^(−z))
 
@@ -41,9 +41,9 @@ with the flow f = Δt g of conductances g [W/K], means over the step θ̄ and φ
 free: without contact, as conduction, losses and sources have it; W_i of the cell itself; and R what a side shows of the heat of
 others and of its other cells, in their mean by conductance. So contacts of one solid are solved together. Nodes are bodies of
 one temperature, φ' = φ − Σ H/K and φ̄ the same with m_a and m_b of a mode that does not decay, and interfaces, where Σ H = 0 and
-Σ J = 0. Solved cell by cell, what is left is a system of twice the sides of each row, and then one of twice the nodes.
+Σ J = 0. Eliminating the cells leaves a system of twice the sides of each row, and then one of twice the nodes.
 
-What flows into cells is what leaves nodes, to rounding. A body of one temperature that touches one other is exact in time.
+Heat into cells equals heat out of nodes, to rounding. A body of one temperature that touches one other is exact in time.
 
 Shapes: `env` environments, `row` rows of cells, `side` sides of patches on each, `node` nodes; `both` H of the sides, then J,
 or temperatures in the mean over the step, then those at its end.
@@ -120,7 +120,7 @@ def response(phi: Four, sigma: Tensor) -> Response:
 
 
 def of_cells(phi: Four, modes: tuple[Modes, ...]) -> Four:
-    """Return what each cell shows of its own heat, Σ_m v_im² φ_k (env or 1, row, x, y, z)."""
+    """Return each cell's response to its own heat, Σ_m v_im² φ_k (env or 1, row, x, y, z)."""
     result = list(phi)
     for axis, part in enumerate(modes):
         squared = (part.vectors * part.vectors).transpose(-2, -1)
@@ -132,10 +132,10 @@ def of_cells(phi: Four, modes: tuple[Modes, ...]) -> Four:
 def of_sides(
     shares: Float[Tensor, "env row side x y z"], own: Four, phi: Four, modes: tuple[Modes, ...]
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Return what sides show of heat of one another (env, row, side, side): of φ₀ to φ₃, all, and without that of cells alone.
+    """Return the sides' responses to one another's heat (env, row, side, side), for φ₀ to φ₃: whole, and less each cell's own.
 
     Args:
-        shares: Those of cells in a side's conductance.
+        shares: Each cell's share of a side's conductance.
         own: See `of_cells`.
         phi: φ₀ to φ₃ of the modes.
         modes: Modes along each axis.
@@ -175,7 +175,7 @@ MOST_UNROLLED = 8  # sides of a row, or nodes, up to which their system is solve
 class Sides(NamedTuple):
     """Which side of a patch is at which node."""
 
-    tables: Mapping[str, Tensor]  # those of `quantities.patches`
+    tables: Mapping[str, Tensor]  # the tables of `quantities.patches`
     is_plain: bool  # whether side n of each row is at node n, and these are all bodies
 
 
@@ -199,10 +199,10 @@ def step(
     modes: tuple[Modes, ...],
     is_implicit: bool,
 ) -> Flows:
-    """Return what flows.
+    """Return the heat flows of a step.
 
     Args:
-        free: What cells are without contact, in the mean over the step and at its end (env, row, x, y, z) each [K].
+        free: Temperatures without contact, in the mean over the step and at its end (env, row, x, y, z) each [K].
         nodes: Temperatures of the bodies of one temperature, the first of the nodes (env, body) [K].
         capacity: C of a row's cells (env, row) [J/K].
         inverse: 1/K of these bodies (env, body) [K/J].
@@ -216,12 +216,12 @@ def step(
     whole = flow.sum(dim=(-3, -2, -1))
     is_side = whole > 0
     shares = flow / torch.where(is_side, whole, 1.0)[..., None, None, None]
-    own = of_cells(phi, modes)
-    every, beside = of_sides(shares, own, phi, modes)
+    by_cell = of_cells(phi, modes)
+    every, beside = of_sides(shares, by_cell, phi, modes)
     sigma = torch.zeros_like(whole[..., 0])
     if not is_implicit:
-        sigma = impulsiveness(*(_shown(part, whole, capacity, inverse, sides) for part in every[:2]))
-    cell = _Two.of(response(own, sigma[..., None, None, None]), capacity[..., None, None, None])
+        sigma = impulsiveness(*(_response_of(part, whole, capacity, inverse, sides) for part in every[:2]))
+    cell = _Two.of(response(by_cell, sigma[..., None, None, None]), capacity[..., None, None, None])
     between = _square(response(tuple(beside), sigma[..., None, None])) / capacity[..., None, None]  # type: ignore[arg-type]
     total = flow.sum(dim=2)
     solved = cell.solved(total)
@@ -237,10 +237,10 @@ def step(
     near = at - _times(between, flows[..., None])[..., 0]
     mean, end = (part[..., None, None, None] for part in near.unflatten(-1, (2, -1)).unbind(2))
     heat, rate = solved.times((flow * (mean - free[0][:, :, None])).sum(dim=2), (flow * (end - free[1][:, :, None])).sum(dim=2))
-    shown = free[0] + cell.mean_of_heat * heat + cell.mean_of_rate * rate
-    heats = flow * (mean - shown[:, :, None])
+    cell_mean = free[0] + cell.mean_of_heat * heat + cell.mean_of_rate * rate
+    heats = flow * (mean - cell_mean[:, :, None])
     got = _at_nodes(sides, heats.sum(dim=(-3, -2, -1)))
-    if num_nodes > num_bodies:  # an interface stores nothing: what rounding leaves over is taken back
+    if num_nodes > num_bodies:  # an interface stores nothing: remove the rounding error
         slack = torch.where(torch.arange(num_nodes, device=got.device) < num_bodies, 0.0, got)
         slack = slack / _positive(_at_nodes(sides, whole))
         heats = heats - flow * _of_nodes(sides, slack)[..., None, None, None]
@@ -276,23 +276,23 @@ def _square(found: Response) -> Float[Tensor, "env row both both"]:
 
 
 def _of_row(flow: Tensor, total: Tensor, solved: _Two, free: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Return how H and J of the sides follow from the nodes' temperatures, (env, row, both, both), and what is taken off."""
+    """Return the matrix from the nodes' temperatures to H and J of the sides (env, row, both, both), and the offset."""
     part = flow / _positive(total)[:, :, None]
 
     def between(factor: Tensor) -> Tensor:
         return ((part * factor[:, :, None])[:, :, :, None] * flow[:, :, None]).sum(dim=(-3, -2, -1))
 
     zero = torch.zeros_like(between(total))
-    result = _square(Response(*(between(own) for own in solved)))
+    result = _square(Response(*(between(term) for term in solved)))
     if flow.shape[2] > 1:  # what sides exchange at once through the cells that they share
         direct = between(torch.ones_like(total))
         direct = torch.diag_embed(direct.sum(dim=-1)) - direct
         result = result + _square(Response(direct, zero, zero, direct))
-    taken = [(flow * own[:, :, None]).sum(dim=(-3, -2, -1)) for own in solved.times(*free)]
+    taken = [(flow * term[:, :, None]).sum(dim=(-3, -2, -1)) for term in solved.times(*free)]
     return result, torch.cat(taken, dim=-1)
 
 
-def _shown(
+def _response_of(
     between: Float[Tensor, "env row side side"],
     whole: Float[Tensor, "env row side"],
     capacity: Tensor,
@@ -302,8 +302,8 @@ def _shown(
     """Return r of a φ: see `response`."""
     bodies = torch.nn.functional.pad(inverse, (0, sides.tables["at_node"].shape[0] - inverse.shape[-1]))
     at_nodes = bodies * _at_nodes(sides, whole)
-    shown = _times(between, whole[..., None])[..., 0] / capacity[..., None] + _of_nodes(sides, at_nodes)
-    return (whole * shown).sum(dim=-1) / _positive(whole.sum(dim=-1))
+    at_sides = _times(between, whole[..., None])[..., 0] / capacity[..., None] + _of_nodes(sides, at_nodes)
+    return (whole * at_sides).sum(dim=-1) / _positive(whole.sum(dim=-1))
 
 
 def _nodes(
@@ -332,16 +332,16 @@ def _nodes(
     columns = [equations(block[..., :num, :], block[..., num:, :], _between_nodes) for block in blocks]
     matrix = torch.cat(columns, dim=-1)
     is_idle = (_diagonal(matrix) == 0).to(nodes.dtype)
-    stores, gain, before = is_idle, torch.ones_like(is_idle), torch.zeros_like(right)
+    stores, gain, start = is_idle, torch.ones_like(is_idle), torch.zeros_like(right)
     if num_bodies:
-        of_faces = [part.unflatten(1, (2, num_nodes))[:, :, num_bodies:] for part in (stores, gain, before)]
+        of_faces = [part.unflatten(1, (2, num_nodes))[:, :, num_bodies:] for part in (stores, gain, start)]
         bodies = torch.ones_like(nodes), inverse.expand_as(nodes), nodes
-        stores, gain, before = (
+        stores, gain, start = (
             torch.cat([part[:, None].expand(-1, 2, -1), faces], dim=-1).flatten(1)
             for part, faces in zip(bodies, of_faces, strict=True)
         )
     matrix = torch.diag_embed(stores) + gain[..., None] * matrix
-    mean, end = _solved(matrix, (stores * before + gain * right)[..., None])[..., 0].unflatten(1, (2, num_nodes)).unbind(1)
+    mean, end = _solved(matrix, (stores * start + gain * right)[..., None])[..., 0].unflatten(1, (2, num_nodes)).unbind(1)
     return mean, end
 
 

@@ -1,4 +1,4 @@
-"""Conduction within links, with what their faces lose: what a step adds to the cells of a box, and makes of a constant source.
+"""Conduction within links with losses at their faces: the change of a box's cells in a step, also from a constant source.
 
     θ̇ = −(M_x + M_y + M_z) θ + s,   M_a = α/Δ_a² (−D² + diag(b)),   b = u Δ_a/k at exposed faces                [K/s]
 
@@ -8,12 +8,12 @@ step of Δt is exact in time:
 
     θ ← (I + G_x) ⊗ (I + G_y) ⊗ (I + G_z) θ + Δt φ₁(x) s,   G = Vᵀ diag(e^(−aμ) − 1) V,   φ₁(x) = (1 − e^(−x))/x
 
-with a = αΔt/Δ² of an axis and x = Σ aμ of a mode of the box. Axes whose cells are few are taken together as one dense operator,
-and those groups one after the other. An operator acts on what cells differ from their mean and on that mean apart, and what it
-adds is made to sum to what leaves through the faces: heat is neither made nor lost, but for rounding of what flows.
+with a = αΔt/Δ² of an axis and x = Σ aμ of a mode of the box. Neighbouring axes with few cells form one dense operator, and the
+operators act one after the other. Each acts separately on the cells' mean and on their differences from it. Its result is
+corrected to sum to the heat through the faces, so heat is conserved to the rounding of the flow.
 
-`spectral` has (kπ/n)² in place of the 4 sin²(kπ/2n) in μ_k: the decay of the continuous solid's modes between insulated walls.
-`semi_implicit` divides each mode of the box by 1 + x (the paper), and has 1/(1 + x) in place of φ₁.
+`spectral` replaces 4 sin²(kπ/2n) in μ_k by (kπ/n)²: the decay of the continuous solid's modes between insulated walls.
+`semi_implicit` divides each mode of the box by 1 + x (the paper), and replaces φ₁ by 1/(1 + x).
 
 Source: Carslaw and Jaeger, *Conduction of Heat in Solids*, 3.9 and 3.11, for modes of a slab that loses heat at its faces;
 Hochbruck and Ostermann, Exponential integrators, *Acta Numerica* 2010, for φ₁.
@@ -45,33 +45,33 @@ class Modes(NamedTuple):
 
 
 class Axis(NamedTuple):
-    """What a step adds along one axis, or along some that follow one another."""
+    """The change of a step along one axis, or along a group of neighbouring axes."""
 
     gains: Float[Tensor, "env row to from"]  # G, symmetric (env, row, to, from) [1]
-    # sums of its columns, what is added to all cells of what one holds (env, row, from) [1]
+    # column sums of G: the change of all cells together per unit in one (env, row, from) [1]
     leaves: Float[Tensor, "env row from"]
     is_there: Float[Tensor, "row cell"]  # 1 for the cells that a row has (row, cell)
 
 
 class Spread(NamedTuple):
-    """What a step does: gains of cells (env, row, x, y, z) [K], and what of their sum came through the faces (env, row) [K]."""
+    """Gains of cells in a step (env, row, x, y, z) [K], and the part of their sum that came through faces (env, row) [K]."""
 
     gained: Tensor
     entered: Tensor
 
 
 def along_axis(rate: Float[Tensor, "env row"], modes: Modes) -> Axis:
-    """Return what a step adds along an axis; the rate is a = αΔt/Δ² [1]."""
+    """Return the change along an axis; the rate is a = αΔt/Δ² [1]."""
     decay = torch.expm1(-rate[..., None] * modes.exponent)
     waves, scaled, totals = modes.vectors, decay[..., None] * modes.vectors, decay * modes.totals
-    # On a GPU a product of matrices may be rounded to ten bits, if its user wants that elsewhere.
+    # On a GPU a matrix product may use TF32 with its ten-bit mantissa, if the user allows that.
     is_summed = waves.is_cuda
     gains = (scaled[..., :, None] * waves[..., None, :]).sum(dim=-3) if is_summed else scaled.transpose(-2, -1) @ waves
     return Axis(gains, (totals[..., None] * waves).sum(dim=-2), (waves[:, 0] > 0).to(waves.dtype))
 
 
 def together(first: Axis, second: Axis) -> Axis:
-    """Return what a step adds along two axes: G ⊗ (I + H) + I ⊗ H."""
+    """Return the change along two axes: G ⊗ (I + H) + I ⊗ H."""
     one, other = (torch.eye(axis.gains.shape[-1], dtype=axis.gains.dtype, device=axis.gains.device) for axis in (first, second))
     outer, inner = first.gains[..., :, None, :, None], second.gains[..., None, :, None, :]
     both = outer * (other[:, None, :] + inner) + one[:, None, :, None] * inner
@@ -82,9 +82,9 @@ def together(first: Axis, second: Axis) -> Axis:
 
 
 def grouped(axes: list[Axis], device: str) -> list[Axis]:
-    """Return axes in groups, in their order: those that follow one another and have few cells together are one.
+    """Return axes in groups, in their order: neighbours with few cells are merged.
 
-    What differs between environments is left in small pieces.
+    Axes that differ between environments are not merged.
     """
     groups: list[Axis] = []
     for axis in reversed(axes):
@@ -98,11 +98,11 @@ def grouped(axes: list[Axis], device: str) -> list[Axis]:
 
 
 def spread(cells: Cells, axes: list[Axis]) -> Spread:
-    """Return what a step does to cells.
+    """Return the change of cells in a step.
 
     Args:
         cells: Temperatures [K].
-        axes: What it adds along x, y and z; or along groups of them that have all cells together.
+        axes: The change along x, y and z, or along groups that cover all three.
     """
     groups, shape, behind = grouped(axes, cells.device.type), cells.shape, 1
     gained, entered = torch.zeros_like(cells), torch.zeros_like(cells[:, :, 0, 0, 0])
@@ -118,29 +118,29 @@ def spread(cells: Cells, axes: list[Axis]) -> Spread:
 def _added(
     cells: Float[Tensor, "env row ahead from behind"], group: Axis
 ) -> tuple[Float[Tensor, "env row ahead to behind"], Float[Tensor, "env row"]]:
-    """Return what a group adds, and what of the sum came through the faces."""
+    """Return the change along a group of axes, and the part of its sum that came through the faces."""
     there, leaves = group.is_there[:, None, :, None], group.leaves[:, :, None, :, None]
     share = there / there.sum(dim=2, keepdim=True)
     mean = (cells * share).sum(dim=3, keepdim=True)
     apart = cells - there * mean
     if apart.is_cuda:
         gains = group.gains[:, :, None, :, None, :]
-        made = (gains * apart.movedim(3, -1)[:, :, :, None]).sum(dim=-1)
+        change = (gains * apart.movedim(3, -1)[:, :, :, None]).sum(dim=-1)
     elif len(group.gains) == 1 and apart.shape[-1] == 1:  # one product for each row, over all environments
         num_envs, num_rows, ahead, size, _ = apart.shape
         flat = apart.transpose(0, 1).reshape(num_rows, num_envs * ahead, size)
-        made = torch.bmm(flat, group.gains[0].transpose(1, 2))
-        made = made.reshape(num_rows, num_envs, ahead, size, 1).transpose(0, 1)
+        change = torch.bmm(flat, group.gains[0].transpose(1, 2))
+        change = change.reshape(num_rows, num_envs, ahead, size, 1).transpose(0, 1)
     else:
-        made = group.gains[:, :, None] @ apart
-    made = made + leaves * mean
+        change = group.gains[:, :, None] @ apart
+    change = change + leaves * mean
     through = (leaves * apart).sum(dim=3, keepdim=True) + mean * leaves.sum(dim=3, keepdim=True)
-    made = made - there * (made * share).sum(dim=3, keepdim=True) + share * through
-    return made, through.sum(dim=(2, 3, 4))
+    change = change - there * (change * share).sum(dim=3, keepdim=True) + share * through
+    return change, through.sum(dim=(2, 3, 4))
 
 
 def along(matrix: Tensor, cells: Cells, axis: int) -> Cells:
-    """Return a matrix of each row times what stands along an axis of its cells.
+    """Return each row's matrix times its cells along an axis.
 
     Args:
         matrix: (row, to, from), or (env, row, to, from).
@@ -149,47 +149,47 @@ def along(matrix: Tensor, cells: Cells, axis: int) -> Cells:
     """
     moved = cells.movedim(2 + axis, -1)  # (env, row, a, b, from)
     if moved.is_cuda:
-        made = (matrix[..., None, None, :, :] * moved[..., None, :]).sum(dim=-1)
+        product = (matrix[..., None, None, :, :] * moved[..., None, :]).sum(dim=-1)
     else:
-        made = moved @ matrix[..., None, :, :].transpose(-2, -1)
-    return made.movedim(-1, 2 + axis)
+        product = moved @ matrix[..., None, :, :].transpose(-2, -1)
+    return product.movedim(-1, 2 + axis)
 
 
 def to_modes(cells: Cells, modes: tuple[Modes, ...]) -> Cells:
-    """Return what each mode of a box has of cells: their mean apart, so that none of it gets into modes that have none."""
+    """Return the amplitude of each mode of a box. The mean is projected by `totals`: modes of zero sum get none of it."""
     there = _there(modes)
     mean = (cells * there).sum(dim=(-3, -2, -1), keepdim=True) / there.sum(dim=(-3, -2, -1), keepdim=True)
     result = cells - there * mean
-    for axis, own in enumerate(modes):
-        result = along(own.vectors, result, axis)
-    return result + mean * outer([own.totals for own in modes], torch.mul)
+    for axis, basis in enumerate(modes):
+        result = along(basis.vectors, result, axis)
+    return result + mean * outer([basis.totals for basis in modes], torch.mul)
 
 
 def from_modes(parts: Cells, modes: tuple[Modes, ...]) -> Spread:
-    """Return what cells gain of parts of modes. What of the sum came through the faces is what modes have of it."""
-    entered = (parts * outer([own.totals for own in modes], torch.mul)).sum(dim=(-3, -2, -1))
-    for axis, own in enumerate(modes):
-        parts = along(own.vectors.transpose(-2, -1), parts, axis)
+    """Return the gains of cells from amplitudes of modes. The modes' own sum is the part that came through the faces."""
+    entered = (parts * outer([basis.totals for basis in modes], torch.mul)).sum(dim=(-3, -2, -1))
+    for axis, basis in enumerate(modes):
+        parts = along(basis.vectors.transpose(-2, -1), parts, axis)
     there = _there(modes)
     excess = parts.sum(dim=(-3, -2, -1)) - entered
     return Spread(parts - there * (excess / there.sum(dim=(-3, -2, -1)))[..., None, None, None], entered)
 
 
 def _there(modes: tuple[Modes, ...]) -> Tensor:
-    return outer([(own.vectors[:, 0] > 0).to(own.vectors.dtype) for own in modes], torch.mul)
+    return outer([(basis.vectors[:, 0] > 0).to(basis.vectors.dtype) for basis in modes], torch.mul)
 
 
 def exponents(rates: Sequence[Float[Tensor, "env row"]], modes: tuple[Modes, ...]) -> Cells:
     """Return x = Σ aμ of the modes of a box, from a of each axis."""
-    return outer([rate[..., None] * own.exponent for rate, own in zip(rates, modes, strict=True)], torch.add)
+    return outer([rate[..., None] * basis.exponent for rate, basis in zip(rates, modes, strict=True)], torch.add)
 
 
 def semi_implicit(cells: Cells, x: Float[Tensor, "#env row x y z"], modes: tuple[Modes, ...]) -> Spread:
-    """Return what a step does that divides each mode by 1 + x."""
+    """Return the change of a step that divides each mode by 1 + x."""
     return from_modes(to_modes(cells, modes) * (-x / (1.0 + x)), modes)
 
 
 def outer(parts: list[Tensor], join) -> Tensor:  # type: ignore[no-untyped-def]
-    """Return products or sums of what modes or cells along x, y and z have (…, x, y, z)."""
+    """Return outer products or sums of values along x, y and z (…, x, y, z)."""
     x, y, z = parts
     return join(join(x[..., :, None, None], y[..., None, :, None]), z[..., None, None, :])

@@ -14,9 +14,9 @@ the patch, both conductivities and the constriction of heat to a small spot (`pa
     y ← T + (y − T_before) e^(−Δt/τ) − (T − T_before)(1 − e^(−Δt/τ)) τ/Δt                                  [°C]
 
 is the reading of a sensing element with time constant τ, exact where T is linear between calls. C_i = ρcV_i is a cell's heat
-capacity [J/K]. Without a source, losses and conduction keep temperatures within those of links and surroundings for any Δt.
-The splitting of 1 and 2 is of first order in Δt; objects with cells have all their losses in 1. The area of a patch is that of
-the contact points' convex hull, or A = π (3 F R/4E*)^(2/3) of a Hertzian contact under the normal force F, whichever is larger.
+capacity [J/K]. Without a source, losses and conduction keep temperatures between extremes of links and surroundings for any Δt.
+The splitting of 1 and 2 is of first order in Δt; objects with cells have all their losses in 1. A patch has the area of the
+contact points' convex hull, or A = π (3 F R/4E*)^(2/3) of a Hertzian contact under the normal force F, whichever is larger.
 
 The heat of objects is part of the sensor's state. An object has one temperature, and conducts from a patch to its middle as a
 cube of its volume would, or a grid with `cells`. An episode begins at the temperatures of the document or the state, and the
@@ -66,12 +66,12 @@ def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> L
     count, size = counts(spec, boxes), boxes[:, 1] - boxes[:, 0]
     there = is_cell(count)
     made_of = [spec.material_of(link.name) for link in layout.links]
-    conductivity = np.array([own.conductivity for own in made_of])
+    conductivity = np.array([material.conductivity for material in made_of])
     for pattern in spec.materials:
         if not any(fnmatchcase(link.name, pattern) for link in layout.links):
-            known = ", ".join(link.name for link in layout.links)
+            link_names = ", ".join(link.name for link in layout.links)
             raise LowerError(
-                f'`materials`: no link of the sensor matches "{pattern}"', field="materials", hint=f"it has {known}"
+                f'`materials`: no link of the sensor matches "{pattern}"', field="materials", hint=f"it has {link_names}"
             )
     film, radiated = _films(spec, made_of, size / count, count)
     if film.any():
@@ -80,7 +80,7 @@ def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> L
     constants = tables(count, size, spec.exposed, film * (size / count) / conductivity[:, None]) | {
         "box": np.concatenate([boxes[:, 0], size / count, count], axis=1),
         "conductivity": conductivity,
-        "volumetric_heat": np.array([own.density * own.specific_heat for own in made_of]),
+        "volumetric_heat": np.array([material.density * material.specific_heat for material in made_of]),
         "ambient": scalar(spec.ambient),
         "start": scalar(spec.start - spec.ambient),
         "is_cell": there.astype(np.float64),
@@ -113,7 +113,7 @@ def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> L
     constants |= {
         f"is_{name}": scalar(1.0) for name in (spec.scheme, spec.model) if name in ("spectral", "semi_implicit", "paper")
     }
-    is_stiff = all(own.youngs_modulus is not None for own in made_of)
+    is_stiff = all(material.youngs_modulus is not None for material in made_of)
     reports, report_rows = {"heat": HEAT}, {}
     if spec.feels:
         reports["objects"], report_rows["objects"] = OBJECTS, Axis("object", len(spec.feels), {"object": spec.feels})
@@ -139,7 +139,7 @@ def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> L
 def _emissivities(spec: TemperatureGridSpec, made_of: list[Material]) -> Float[np.ndarray, " row"]:
     if spec.emissivity is None:
         return np.zeros(len(made_of))
-    return np.array([own.emissivity if spec.emissivity == "material" else spec.emissivity for own in made_of])
+    return np.array([material.emissivity if spec.emissivity == "material" else spec.emissivity for material in made_of])
 
 
 def _films(
@@ -148,7 +148,7 @@ def _films(
     """Return u₀ of each link's faces across each axis [W/(m²·K)], and the share of it that is radiation: see `losses`."""
     if spec.model == "paper":
         return np.zeros(step.shape), np.zeros(len(step))
-    k = np.array([own.conductivity for own in made_of])[:, None]
+    k = np.array([material.conductivity for material in made_of])[:, None]
     radiated = _radiated(spec, made_of)
     total = radiated + (spec.convection or 0.0)
     num_ends = np.array([sum(face[1] == axis for face in spec.exposed) for axis in "xyz"])
@@ -166,7 +166,7 @@ def _contact(spec: TemperatureGridSpec, made_of: list[Material], size: np.ndarra
         return {}
     result = {}
     if spec.contact_area == "manifold":
-        moduli = [(own.youngs_modulus, own.poissons_ratio or 0.0) for own in made_of]
+        moduli = [(material.youngs_modulus, material.poissons_ratio or 0.0) for material in made_of]
         result["compliance"] = np.array([0.0 if e is None else (1.0 - nu * nu) / e for e, nu in moduli])
         radius = 0.5 * size.min(axis=1) if spec.curvature_radius is None else np.full(len(size), spec.curvature_radius)
         result["curvature"] = 1.0 / radius
@@ -178,7 +178,7 @@ def _contact(spec: TemperatureGridSpec, made_of: list[Material], size: np.ndarra
 
 
 def _source(spec: TemperatureGridSpec, count: np.ndarray, size: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the heat that is made in each cell (row, x, y, z) [W]; of the paper's formula q/Δ of each row [W/m³]."""
+    """Return the heat source of each cell (row, x, y, z) [W]; for the paper's formula q/Δ of each row [W/m³]."""
     source, there = spec.source, is_cell(count)
     assert source is not None
     if source.flux is None or source.face is None:
@@ -193,7 +193,7 @@ def _is_read(spec: TemperatureGridSpec, count: np.ndarray, size: np.ndarray) -> 
 
 
 def _rows(spec: TemperatureGridSpec, layout: Layout, count: np.ndarray, boxes: np.ndarray) -> Axis:
-    """Return what is read, with the boxes that it is read of: centres and sides, along their bodies' axes [m]."""
+    """Return the rows of the reading with their boxes: centres and sides, along the bodies' axes [m]."""
     sides = boxes[:, 1] - boxes[:, 0]
     if spec.outputs not in ("cells", "surface"):
         table = {"link": [link.name for link in layout.links], "pos": 0.5 * (boxes[:, 0] + boxes[:, 1]), "size": sides}
@@ -206,31 +206,31 @@ def _rows(spec: TemperatureGridSpec, layout: Layout, count: np.ndarray, boxes: n
 
 
 def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
-    """Return temperatures [°C], and by link and object what heat they hold and got [J]."""
-    before = state["cells"]
+    """Return temperatures [°C], and the stored and received heat of each link and object [J]."""
+    previous = state["cells"]
     heat = advanced(gathered[ContactPatches], context, constants, state)
     new = {"cells": heat.cells, "cells_low": heat.cells_low}
     if "objects" in state:
         new |= {"objects": heat.objects.flatten(1), "objects_low": heat.objects_low.flatten(1)}
     seen = heat.cells + heat.cells_low
     if "lag" in constants:
-        seen = new["measured"] = _lagged(seen, before, state["measured"], constants, context)
+        seen = new["measured"] = _lagged(seen, previous, state["measured"], constants, context)
     readings = {"signal": (_output(seen, constants) + constants["ambient"])[:, None], **_reports(heat, constants)}
     return readings, new
 
 
 def _lagged(after: Tensor, before: Tensor, measured: Tensor, constants: Constants, context: Context) -> Tensor:
-    """Return what an element with a lag measures of temperatures that are linear between calls [K]."""
+    """Return the reading of an element with a lag, for temperatures that are linear between calls [K]."""
     is_first = context.is_first[..., None, None, None]
     ratio = context.dt / constants["lag"]
     if "is_paper" in constants:
         return torch.where(is_first, after, measured + ratio * (after - measured))
-    kept, moved = torch.exp(-ratio), -torch.expm1(-ratio) / ratio
-    return torch.where(is_first, after, after + (measured - before) * kept - (after - before) * moved)
+    decay, moved = torch.exp(-ratio), -torch.expm1(-ratio) / ratio
+    return torch.where(is_first, after, after + (measured - before) * decay - (after - before) * moved)
 
 
 def _output(cells: Tensor, constants: Constants) -> Tensor:
-    """Return what is read of cells above ambient, (env, row)."""
+    """Return the reading above ambient, from cells above ambient, (env, row)."""
     if "share" not in constants:
         flat = cells.flatten(1)
         return flat[:, constants["read"]] if "read" in constants else flat

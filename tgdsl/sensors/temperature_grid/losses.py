@@ -2,15 +2,15 @@
 
     C θ̇ = −A u θ,   1/u = 1/H + R,   H = h + εσ (T_s + T_a)(T_s² + T_a²),   θ_s = θ/(1 + H R)                    [W]
 
-with θ = T − T_a of a cell [K], θ_s that of its surface, and T in kelvins where they are powers. R is the resistance between a
-cell and its exposed face across an axis,
+with θ = T − T_a of a cell [K], θ_s of its surface, and T in kelvins where they are powers. R is the resistance between a cell
+and its exposed face across an axis,
 
     R = Δ/2k · (1 − e/3n)                                                                                    [m²K/W]
 
-with n cells along the axis and e of its two ends exposed. Δ/2k is that of half a cell; the factor makes it that of what cells
-hold, their mean, under the parabola by which a body cools slowly: Δ/6k of one cell. It takes R to Δ/2k as cells get small, and
-the error of losses from first to second order in Δ. A body of one temperature counts as one cell, Δ the side of a cube of its
-volume. H in θ_s is that of θ at the step's begin.
+with n cells along the axis and e of its two ends exposed. Δ/2k is the resistance of half a cell. The factor corrects it for
+cells that hold their mean, under the parabola of a slowly cooling body: Δ/6k for one cell. R tends to Δ/2k as cells get small,
+and the error of losses is of second order in Δ, not first. A body of one temperature counts as one cell; Δ is the side of a
+cube of its volume. H in θ_s is evaluated at θ of the step's start.
 
 Linear losses of a link's faces, u₀ with H₀ = h + 4εσ T_a³, are part of the exact operator of conduction (`diffusion`); `lost`
 does the rest, u − u₀, which is radiation beyond its tangent at T_a, and all of bodies that have no such operator. A step takes
@@ -67,22 +67,22 @@ class Surfaces(NamedTuple):
 
 
 def lost(above: Tensor, surfaces: Surfaces, dt: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what temperatures above the surroundings gain in a step [K], and the share of it that is radiation [1]."""
+    """Return the gain of temperatures above the surroundings in a step [K], and its radiated share [1]."""
     total, _ = _coefficient(above, surfaces)
     covered = [1.0 / (1.0 + total * face.resistance) for face in surfaces.faces]
     whole = sum((face.area * part for face, part in zip(surfaces.faces, covered, strict=True)), torch.zeros_like(above))
     middle = above * torch.exp(-0.5 * dt * total * whole)
     rate, glowing = torch.zeros_like(above), torch.zeros_like(above)
     for face, part in zip(surfaces.faces, covered, strict=True):
-        own, radiated = _coefficient(middle * part, surfaces)
-        through = 1.0 / (1.0 + own * face.resistance)
-        rate, glowing = rate + face.area * (own * through), glowing + face.area * (radiated * through)
+        coefficient, radiated = _coefficient(middle * part, surfaces)
+        through = 1.0 / (1.0 + coefficient * face.resistance)
+        rate, glowing = rate + face.area * (coefficient * through), glowing + face.area * (radiated * through)
         if face.film is not None and face.film_radiated is not None:
             rate, glowing = rate - face.area * face.film, glowing - face.area * (face.film * face.film_radiated)
     is_any = rate != 0
     share = torch.where(is_any, glowing, 0.0) / torch.where(is_any, rate, 1.0)
-    # One number for what cells lose and what is reported: computed again in another kernel, where the films' difference is
-    # contracted otherwise, the two are 1e-4 apart.
+    # The loss of cells and the report must be one number: another kernel contracts the films' difference differently, and the
+    # two are then 1e-4 apart.
     return materialised(above * torch.expm1(-rate * dt)), share
 
 
@@ -104,7 +104,7 @@ def least_squared_wavenumber() -> float:
 def paper_step(
     cells: Tensor, objects: Tensor, rows: Rows, patches: ContactPatch, constants: Constants, dt: Tensor
 ) -> tuple[Tensor, ...]:
-    """Return what links' cells gain from conduction, source, radiation, convection and contact (env, link, x, y, z) each [K].
+    """Return gains of links' cells from conduction, source, radiation, convection and contact (env, link, x, y, z) each [K].
 
     The formulas of the paper as printed: `model: paper`.
 
@@ -114,18 +114,18 @@ def paper_step(
         ΔT = −Δt [εσ (T⁴ − T_a⁴) + h (T − T_a)] / (ρc)               in every cell at a face
         T_meas ← T_meas + Δt/τ (T − T_meas)
 
-    one after the other, each with the temperatures of before it. The losses have no length in them, so they are some 1/Δ times
-    too large in number; contact is quadratic in area and explicit, so it explodes; the object keeps its temperature. A is the
-    polygon of the contact points, at least πδ, which is a length; the penetration δ is that of a Hertzian contact, a²κ.
+    one after the other, each from the temperatures left by the last. The losses contain no length, so their values are about
+    1/Δ times too large. Contact is quadratic in area and explicit, so it diverges. The object keeps its temperature. A is the
+    area of the contact points' polygon, at least πδ, which is a length; δ = a²κ is the penetration of a Hertzian contact.
 
     Source: the paper's appendix on TemperatureGrid.
 
     Args:
         cells: Temperatures above ambient (env, link, x, y, z) [K].
-        objects: Those of the objects (env, object) [K].
-        rows: What the links are made of.
-        patches: What they touch.
-        constants: What `lower` folded.
+        objects: Temperatures of the objects (env, object) [K].
+        rows: Materials of the links.
+        patches: Their contact patches.
+        constants: Constants from `lower`.
         dt: Δt [s].
     """
     alpha = rows.diffusivity * dt
@@ -133,10 +133,10 @@ def paper_step(
     x = torch.maximum(x, alpha[..., None, None, None] * least_squared_wavenumber())
     spread = diffusion.semi_implicit(cells, x, rows.modes).gained
     heat = rows.conductivity / rows.diffusivity
-    made = torch.zeros_like(cells)
+    generated = torch.zeros_like(cells)
     if "paper_source" in constants:
-        made = made + (dt * constants["paper_source"] / heat)[..., None, None, None] * constants["is_cell"]
-    now = cells + spread + made
+        generated = generated + (dt * constants["paper_source"] / heat)[..., None, None, None] * constants["is_cell"]
+    now = cells + spread + generated
     touched = torch.zeros_like(cells)
     if patches.topology.num_objects:
         touched = _touched(now, objects, rows, patches, constants, dt)
@@ -153,7 +153,7 @@ def paper_step(
         radiated = -scale * outer * flux
     if "convection" in constants:
         blown = -scale * outer * constants["convection"] * now
-    return spread, made, radiated, blown, touched
+    return spread, generated, radiated, blown, touched
 
 
 def paper_area(patches: ContactPatch, constants: Constants) -> Tensor:
@@ -168,12 +168,12 @@ def paper_area(patches: ContactPatch, constants: Constants) -> Tensor:
 
 
 def _touched(now: Tensor, objects: Tensor, rows: Rows, patches: ContactPatch, constants: Constants, dt: Tensor) -> Tensor:
-    """Return what cells gain from what they touch [K]."""
-    own, other = rows.conductivity[..., None], patches.objects.conductivity[:, None, :]
+    """Return the gains of cells from contact [K]."""
+    k, other = rows.conductivity[..., None], patches.objects.conductivity[:, None, :]
     volume = (rows.boxes.step[0] * rows.boxes.step[1] * rows.boxes.step[2])[:, None]
     heat = (rows.conductivity / rows.diffusivity)[..., None]
     size = paper_area(patches, constants)
-    rate = dt * 2.0 * own * other / (own + other) * size * size / (volume * volume * heat)
+    rate = dt * 2.0 * k * other / (k + other) * size * size / (volume * volume * heat)
     at = _at_centre(rows, patches)
     warmer = objects[:, None, :, None, None, None] - now[:, :, None]
     return (rate[..., None, None, None] * at * warmer).sum(dim=2)

@@ -1,30 +1,30 @@
 """How a patch joins the cells of a box: which of them, and with what conductance.
 
-A patch is taken for a square of its area A across its normal, about its centre, moved into the box where it would stand over.
-It sees the temperature that is interpolated linearly between the centres of cells and constant beyond the last one: cell i
-takes the share w_i of it, products of one factor per axis.
+A patch is treated as a square of its area A across its normal, about its centre, moved to lie inside the box. Its temperature
+is interpolated linearly between the centres of cells and constant beyond the last one: cell i has the share w_i, a product of
+one factor per axis.
 
     G = 2 k A/d + 4 k a φ/(1 + ρ/2) · (1 + ¾ ρ (2q − 1) max(0, 1 − 2ρ)),   ρ = a/Δ,   a = √(A/π)          [W/K]
 
-is its conductance to the cells. The first term is that of half a cell, d thick along the normal, below the patch, in the shares
-w_i. The second is the constriction of heat towards a spot that is smaller than a cell, Δ the side of one across the normal: of
-a small spot alone it is that of an isothermal disc on a half-space, 4ka; it fades as cells resolve the spot, and stands at the
-patch's four edges, each with the part φ of it that is not within half a cell of the box's own end, where heat cannot spread: a
-patch that covers the face has none. q = Σ w_i² across the normal tells how many cells share the spot [1]. Beyond ρ/2, which
-follows from the resistance of the cells' own grid at large ρ, the last factor was fitted to that grid's Green's function: a
-disc on a half-space of cells has its closed-form resistance 1/4ka to 1.5 %, for Δ from a/4 to 10 a and wherever it is.
+is its conductance to the cells. The first term is half a cell below the patch, d thick along the normal, in the shares w_i. The
+second is the constriction of heat towards a spot smaller than a cell; Δ is the side of a cell across the normal. For a small
+spot it is 4ka, an isothermal disc on a half-space; it fades as cells resolve the spot. It acts at the patch's four edges, each
+with the part φ that is not within half a cell of the box's end, where heat cannot spread: it is zero for a patch that covers
+the face. q = Σ w_i² across the normal tells how many cells share the spot [1]. The term ρ/2 follows from the resistance of the
+cells' grid at large ρ. The last factor was fitted to that grid's Green's function: a disc on a half-space of cells has its
+closed-form resistance 1/4ka to 1.5 %, for Δ from a/4 to 10 a and any position.
 
 Source: Carslaw and Jaeger, *Conduction of Heat in Solids*, 8.2, for the disc.
 
 Shapes: `env` environments, `row` rows of cells, `side` sides of patches on each, `cell` cells along an axis.
 
-From patches to conductances: their areas, and what stands in series with the cells of a link.
+Areas of patches, and the resistances in series with the cells of a link:
 
     A = max(A_polygon, π (3 F / (4 E* κ))^(2/3)),   1/E* = (1 − ν₁²)/E₁ + (1 − ν₂²)/E₂,   κ = 1/R₁ + 1/R₂     [m²]
     G_o = 2 k_o A/D + 4 k_o a φ/(1 + a/2D),   D = V^(1/3),   φ = max(0, 1 − √A/D)                            [W/K]
 
-G_o is what a body of one temperature conducts from the patch to its middle, by the formula of `conductances` for a cube of its
-volume in one cell. Source: Johnson, *Contact Mechanics*, 4.2.
+G_o is the conductance of a body of one temperature from the patch to its middle: the formula of `conductances` for a cube of
+its volume in one cell. Source: Johnson, *Contact Mechanics*, 4.2.
 
 Shapes: `env` environments, `body` links, `object` objects, `row` rows of cells, `side` sides of patches on each.
 """
@@ -45,7 +45,7 @@ from tgdsl.sensors.temperature_grid.rows import Boxes, Rows, num_cells
 
 
 def least_width() -> float:
-    """Return the least half-width of a patch along an axis [cells]: from there on shares are those of a point."""
+    """Return the least half-width of a patch along an axis [cells]; a smaller patch has a point's shares."""
     return 0.05
 
 
@@ -86,8 +86,8 @@ def conductances(
     radius = torch.sqrt(fit / planes.pi())
     rho = radius * torch.sqrt(depth / volume)
     few = torch.ones_like(area)
-    for part, own in zip(parts, across, strict=True):
-        few = few * (1.0 - own * (1.0 - part.squared))
+    for part, weight in zip(parts, across, strict=True):
+        few = few * (1.0 - weight * (1.0 - part.squared))
     fitted = 1.0 + 0.75 * rho * (2.0 * few - 1.0) * (1.0 - 2.0 * rho).clamp(min=0.0)
     cover = torch.where(is_any, 2.0 * k * fit / depth, 0.0)
     spot = torch.where(is_any, 4.0 * k * radius / (1.0 + 0.5 * rho) * fitted, 0.0)
@@ -95,18 +95,18 @@ def conductances(
 
 
 def _spread(cover: Tensor, spot: Tensor, across: Vec, parts: list[Axis]) -> Tensor:
-    """Return conductances shared out: those of what is covered by the shares, those of the spot at its edges."""
+    """Return conductances per cell: `cover` distributed by the shares, `spot` at the edges."""
     (x, y, z), (ex, ey, ez) = ([getattr(part, name) for part in parts] for name in ("shares", "edges"))
     x, ex = (part[..., :, None, None] for part in (x, ex))
     y, ey = (part[..., None, :, None] for part in (y, ey))
     z, ez = (part[..., None, None, :] for part in (z, ez))
-    tx, ty, tz = ((0.5 * spot * own)[..., None, None, None] for own in across)
+    tx, ty, tz = ((0.5 * spot * weight)[..., None, None, None] for weight in across)
     body = cover[..., None, None, None]
     return x * (y * (body * z + tz * ez) + ty * ey * z) + tx * ex * y * z
 
 
 def _along(centre: Tensor, half: Tensor, length: Tensor, num_cells: int) -> Axis:
-    """Return what a patch is along one axis; all lengths in cells."""
+    """Return a patch's shares and edges along one axis; all lengths in cells."""
     is_wide = half > 0
     middle = 0.5 * length
     fits = torch.minimum(half, middle)
@@ -118,10 +118,10 @@ def _along(centre: Tensor, half: Tensor, length: Tensor, num_cells: int) -> Axis
     top = length - 0.5
     low, high = about - width, about + width
     covered = _below(_clamped(high, top)[..., None] - place) - _below(_clamped(low, top)[..., None] - place)
-    before = (0.5 - low).clamp(min=0.0) - (0.5 - high).clamp(min=0.0)
+    before_first = (0.5 - low).clamp(min=0.0) - (0.5 - high).clamp(min=0.0)
     after = (high - top).clamp(min=0.0) - (low - top).clamp(min=0.0)
     is_last = (place - top[..., None]).abs() < 0.25
-    covered = covered + torch.where(place < 1.0, before[..., None], 0.0) + torch.where(is_last, after[..., None], 0.0)
+    covered = covered + torch.where(place < 1.0, before_first[..., None], 0.0) + torch.where(is_last, after[..., None], 0.0)
     shares = covered / (2.0 * width)[..., None]
     ends = centre - fits, centre + fits
     is_open = (2.0 * ends[0]).clamp(0.0, 1.0), (2.0 * (length - ends[1])).clamp(0.0, 1.0)
@@ -181,10 +181,10 @@ def resistance(area: Tensor, patches: ContactPatch, lumped: tuple[int, ...], con
     safe = torch.where(area > 0, area, 1e-6)
     series = torch.zeros_like(area)
     if lumped:
-        made = _inside(safe, patches)
+        inside = _inside(safe, patches)
         count = area.shape[-1]
         is_lumped = [1.0 if i in lumped else 0.0 for i in range(count)]
-        series = made if all(is_lumped) else made * _of_objects(is_lumped, area)
+        series = inside if all(is_lumped) else inside * _of_objects(is_lumped, area)
     if "contact_conductance" in constants:
         film = 1.0 / (constants["contact_conductance"] * safe)
         halves = [1.0 if i in lumped else 0.5 for i in range(area.shape[-1])]

@@ -43,7 +43,7 @@ class Block:
     def operators(self, film: np.ndarray | None = None, is_smooth: bool = False) -> list[np.ndarray]:
         """Return −α∇² along each axis (cell, cell), with what exposed ends lose through a film by axis [W/(m²·K)], [1/s].
 
-        Its modes decay as those of the cells, or as those of the continuous solid.
+        Its modes decay like the cells' modes, or with `is_smooth` like the continuous solid's.
         """
         assert self.count is not None
         alpha, result = self.conductivity * self.step.prod() / self.capacity, []
@@ -66,7 +66,7 @@ class Block:
         return [0 if face[0] == "-" else -1 for face in self.exposed if face[1] == "xyz"[axis]]
 
     def resistance(self, axis: int) -> float:
-        """Return that between what a cell holds and its face across an axis [m²·K/W]: the equation of `losses`."""
+        """Return the resistance between a cell and its face across an axis [m²·K/W]: the equation of `losses`."""
         assert self.count is not None
         return self.step[axis] / (2 * self.conductivity) * (1 - len(self.ends(axis)) / (3 * self.count[axis]))
 
@@ -74,23 +74,23 @@ class Block:
 def reference(
     spec: TemperatureGridSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return the temperatures read [°C] (row, 1), and what is remembered."""
+    """Return the reading [°C] (row, 1), and the next state."""
     result: ReferencePatches = gathered[ContactPatches]
     links, objects = (
         _links(spec, layout, result),
-        [_object(spec, own, result.topology.cells[i], i in result.topology.grids) for i, own in enumerate(result.objects)],
+        [_object(spec, body, result.topology.cells[i], i in result.topology.grids) for i, body in enumerate(result.objects)],
     )
-    before = {name: np.array(value, dtype=np.float64) for name, value in state.items()}
-    _load(links, objects, result, before, spec, context)
+    previous = {name: np.array(value, dtype=np.float64) for name, value in state.items()}
+    _load(links, objects, result, previous, spec, context)
     if not context.is_first:
         (_advance if spec.model == "physical" else _advance_as_printed)(spec, result, links, objects, context.dt)
-    after = _store(links, objects, result, before)
+    after = _store(links, objects, result, previous)
     seen = after["cells"]
     if spec.lag is not None:
         ratio = context.dt / spec.lag
-        kept = np.exp(-ratio)
-        lagged = seen + (before["measured"] - before["cells"]) * kept - (seen - before["cells"]) * (1 - kept) / ratio
-        lagged = lagged if spec.model == "physical" else before["measured"] + ratio * (seen - before["measured"])
+        decay = np.exp(-ratio)
+        lagged = seen + (previous["measured"] - previous["cells"]) * decay - (seen - previous["cells"]) * (1 - decay) / ratio
+        lagged = lagged if spec.model == "physical" else previous["measured"] + ratio * (seen - previous["measured"])
         seen = after["measured"] = seen.copy() if context.is_first else lagged
     return _output(spec, seen, counts(spec, result.boxes)) + spec.ambient, after
 
@@ -131,18 +131,18 @@ def _outer(count: tuple[int, ...], step: np.ndarray, faces: tuple[str, ...]) -> 
 
 
 def _load(links, objects, found, before, spec, context) -> None:  # type: ignore[no-untyped-def]
-    """Put what was remembered, or the start, into the blocks."""
+    """Set the blocks' temperatures from the state, or at the first call from the start."""
     for i, block in enumerate(links):
         x, y, z = block.count
         block.above = (
             np.full(block.count, spec.start - spec.ambient) if context.is_first else before["cells"][i, :x, :y, :z].copy()
         )
-    most = tuple(max(own[axis] for own in found.topology.cells) for axis in range(3)) if objects else ()
+    most = tuple(max(count[axis] for count in found.topology.cells) for axis in range(3)) if objects else ()
     for i, block in enumerate(objects):
         x, y, z = found.topology.cells[i]
-        own = found.objects[i].start
+        start = found.objects[i].start
         if context.is_first:
-            block.above = np.full(block.above.shape, 0.0 if own is None else own - spec.ambient)
+            block.above = np.full(block.above.shape, 0.0 if start is None else start - spec.ambient)
         else:
             block.above = before["objects"].reshape(-1, *most)[i, :x, :y, :z].reshape(block.above.shape).copy()
 
@@ -153,7 +153,7 @@ def _store(links, objects, found, before) -> dict[str, np.ndarray]:  # type: ign
         x, y, z = block.count
         after["cells"][i, :x, :y, :z] = block.above
     if objects:
-        most = tuple(max(own[axis] for own in found.topology.cells) for axis in range(3))
+        most = tuple(max(count[axis] for count in found.topology.cells) for axis in range(3))
         shaped = np.zeros((len(objects), *most))
         for i, block in enumerate(objects):
             x, y, z = found.topology.cells[i]
@@ -185,18 +185,19 @@ def _advance_as_printed(
     spec: TemperatureGridSpec, found: ReferencePatches, links: list[Block], objects: list[Block], dt: float
 ) -> None:
     """Take a step by the paper's formulas; objects that are links of the sensor have their mean temperature before it."""
-    others = [links[own].above.mean() if own >= 0 else objects[i].above.flat[0] for i, own in enumerate(found.topology.links)]
+    bodies = found.topology.links
+    temperatures = [links[b].above.mean() if b >= 0 else objects[i].above.flat[0] for i, b in enumerate(bodies)]
     for b, block in enumerate(links):
         heat = block.capacity / block.step.prod()
         block.above = _diffused(spec.model_copy(update={"scheme": "semi_implicit"}), block, dt, least=1e-6)
         if spec.source is not None and spec.source.flux is not None and spec.source.face is not None:
             block.above = block.above + dt * spec.source.flux / (block.step["xyz".index(spec.source.face[1])] * heat)
         gains = np.zeros_like(block.above)
-        for o, other in enumerate(others):
+        for o, other in enumerate(temperatures):
             if (b, o) in found.patches:
-                patch, own = found.patches[b, o], found.objects[o]
+                patch, material = found.patches[b, o], found.objects[o]
                 place = np.clip(np.floor((patch.pos - block.corner) / block.step), 0, np.array(block.count) - 1).astype(int)
-                k = 2 * block.conductivity * own.conductivity / (block.conductivity + own.conductivity)
+                k = 2 * block.conductivity * material.conductivity / (block.conductivity + material.conductivity)
                 area = _area(spec, found, links, b, o, patch)
                 at = tuple(place)
                 gains[at] += dt * k * (other - block.above[at]) * area**2 / (block.step.prod() ** 2 * heat)
@@ -217,25 +218,25 @@ def _film(spec: TemperatureGridSpec, block: Block) -> np.ndarray:
 
 
 def _lose(spec: TemperatureGridSpec, block: Block, dt: float, film: np.ndarray) -> None:
-    """Take off what is lost beyond a film by axis."""
+    """Subtract the losses beyond a film by axis."""
     if block.count is None:
         width = block.volume ** (1 / 3) if np.isfinite(block.volume) else 1.0
         faces = [(np.array([block.area]), width / (6 * block.conductivity), 0.0)]
     else:
         across = [tuple(face for face in block.exposed if face[1] == axis) for axis in "xyz"]
-        faces = [(_outer(block.count, block.step, own), block.resistance(axis), film[axis]) for axis, own in enumerate(across)]
+        faces = [(_outer(block.count, block.step, end), block.resistance(axis), film[axis]) for axis, end in enumerate(across)]
     start = _coefficient(spec, block, block.above)
     rate = sum(area * start / (1 + start * resistance) for area, resistance, _ in faces) / block.capacity
     middle = block.above * np.exp(-0.5 * rate * dt)
     rate = np.zeros_like(block.above)
     for area, resistance, linear in faces:
-        own = _coefficient(spec, block, middle / (1 + start * resistance))
-        rate = rate + area * (own / (1 + own * resistance) - linear) / block.capacity
+        coefficient = _coefficient(spec, block, middle / (1 + start * resistance))
+        rate = rate + area * (coefficient / (1 + coefficient * resistance) - linear) / block.capacity
     block.above = block.above * np.exp(-rate * dt)
 
 
 def _source(spec: TemperatureGridSpec, block: Block) -> np.ndarray:
-    """Return the heat that is made in each cell [W]."""
+    """Return the heat source of each cell [W]."""
     if spec.source is None:
         return np.zeros(block.count)  # type: ignore[arg-type]
     if spec.source.face is not None:
@@ -253,7 +254,7 @@ def _diffused(
 ) -> np.ndarray:
     """Return temperatures after conduction within a box, linear losses and a constant source [K/s]."""
     axes, size = block.operators(film, spec.scheme != "exact"), block.above.size
-    made = source * np.ones(block.count)  # type: ignore[arg-type]
+    generated = source * np.ones(block.count)  # type: ignore[arg-type]
     if spec.scheme == "exact":
         from scipy.linalg import expm
 
@@ -262,11 +263,11 @@ def _diffused(
         whole = np.kron(np.kron(x, one[1]), one[2]) + np.kron(np.kron(one[0], y), one[2]) + np.kron(np.kron(one[0], one[1]), z)
         # With a last row that is 0 and a last number that stays 1 the exponential takes the source along.
         matrix = np.zeros((size + 1, size + 1))
-        matrix[:size, :size], matrix[:size, size] = -whole, made.ravel()
+        matrix[:size, :size], matrix[:size, size] = -whole, generated.ravel()
         return (expm(dt * matrix) @ np.append(block.above, 1.0))[:size].reshape(block.count)
     alpha = block.conductivity * block.step.prod() / block.capacity
     bases, decay = [], np.zeros(block.count)  # type: ignore[arg-type]
-    modes, made_of = block.above, made
+    modes, made_of = block.above, generated
     for axis, matrix in enumerate(axes):
         values, basis = np.linalg.eigh(matrix)
         bases.append(basis)
@@ -292,49 +293,50 @@ def _touch(
     where, blocks = found.topology, list(links)
     blocks += [objects[i] for i in where.grids]
     bodies = [objects[i] for i in where.lumped]
-    gridded = {i: len(links) + n for n, i in enumerate(where.grids)} | {i: own for i, own in enumerate(where.links) if own >= 0}
+    gridded = {i: len(links) + n for n, i in enumerate(where.grids)}
+    gridded |= {i: link for i, link in enumerate(where.links) if link >= 0}
     sides: list[tuple[int, int, np.ndarray]] = []
     for (b, o), patch in found.patches.items():
         area = _area(spec, found, links, b, o, patch)
         if area <= 0:
             continue
         film = 0.0 if spec.contact_conductance is None else 1.0 / (spec.contact_conductance * area)
-        own = _conductances(links[b], area, patch.pos, patch.normal)
+        conductances = _conductances(links[b], area, patch.pos, patch.normal)
         if o in where.lumped:
             series = film + _inside(found.objects[o], area)
-            sides.append((b, where.lumped.index(o), own / (1.0 + own.sum() * series)))
+            sides.append((b, where.lumped.index(o), conductances / (1.0 + conductances.sum() * series)))
             continue
         node, other = len(bodies) + where.interfaces.index((b, o)), gridded[o]
-        sides.append((b, node, own / (1.0 + own.sum() * 0.5 * film)))
-        own = _conductances(blocks[other], area, patch.object_pos, patch.object_normal)
-        sides.append((other, node, own / (1.0 + own.sum() * 0.5 * film)))
+        sides.append((b, node, conductances / (1.0 + conductances.sum() * 0.5 * film)))
+        conductances = _conductances(blocks[other], area, patch.object_pos, patch.object_normal)
+        sides.append((other, node, conductances / (1.0 + conductances.sum() * 0.5 * film)))
     # Unknown are H and J of each side and cell that it touches, then temperatures of interfaces, in the mean and at the end.
     row, node, side, cell, flow = (
         np.concatenate([np.array(part) for part in parts]) if sides else np.zeros(0, dtype=int)
         for parts in zip(
             *(
-                (np.full(at.size, r), np.full(at.size, n), np.full(at.size, s), at, dt * own[at])
-                for s, (r, n, own) in enumerate(sides)
-                for at in [np.flatnonzero(own > 0)]
+                (np.full(at.size, r), np.full(at.size, n), np.full(at.size, s), at, dt * conductances[at])
+                for s, (r, n, conductances) in enumerate(sides)
+                for at in [np.flatnonzero(conductances > 0)]
             ),
             strict=True,
         )
     ) if sides else (np.zeros(0, dtype=int),) * 5  # fmt: skip
     inverse = np.array([1.0 / body.capacity for body in bodies] + [0.0] * len(where.interfaces))
-    before = np.array([float(body.above.flat[0]) for body in bodies] + [0.0] * len(where.interfaces))
-    num, faces = len(row), [n for n in range(len(bodies), len(before)) if (node == n).any()]
+    nodes = np.array([float(body.above.flat[0]) for body in bodies] + [0.0] * len(where.interfaces))
+    num, faces = len(row), [n for n in range(len(bodies), len(nodes)) if (node == n).any()]
     free, sigma = np.zeros((2, num)), np.zeros(len(blocks))
     shows = np.zeros((4, num, num))
     share = flow / np.array([flow[side == s].sum() for s in side]) if num else flow
-    of_node = np.array([flow[node == n].sum() for n in range(len(before))])
+    of_node = np.array([flow[node == n].sum() for n in range(len(nodes))])
     for r, block in enumerate(blocks):
         at = row == r
         film = _film(spec, block) if r < len(links) else None
         power = _operator(spec, block, dt, film)
         phi = [power(k) for k in range(4)]
-        made = dt * _source(spec, block).ravel() / block.capacity if r < len(links) else np.zeros(block.above.size)
+        generated = dt * _source(spec, block).ravel() / block.capacity if r < len(links) else np.zeros(block.above.size)
         for k, ends in enumerate(((1, 2), (0, 1))):
-            free[k, at] = (phi[ends[0]] @ block.above.ravel() + phi[ends[1]] @ made)[cell[at]]
+            free[k, at] = (phi[ends[0]] @ block.above.ravel() + phi[ends[1]] @ generated)[cell[at]]
         if not at.any():
             continue
         mine = [part[np.ix_(cell[at], cell[at])] for part in phi]
@@ -357,7 +359,7 @@ def _touch(
     is_same = (node[:, None] == node[None]) * inverse[node][:, None] if num else np.zeros((0, 0))
     for k, (at, to) in enumerate(itertools.product((i, j), (i, j))):
         matrix[np.ix_(at, to)] += flow[:, None] * (shows[k] + is_same * lump[None, :, k])
-    right[i], right[j] = (flow * (before[node] - part) if num else part for part in free)
+    right[i], right[j] = (flow * (nodes[node] - part) if num else part for part in free)
     for f, n in enumerate(faces):
         for at, place in ((i, 2 * num + f), (j, 2 * num + len(faces) + f)):
             matrix[at, place] = -flow * (node == n)
@@ -382,7 +384,7 @@ def _responses(phi: list[Any], sigma: float) -> list[Any]:
 
 
 def _impulsiveness(start: float, constant: float) -> float:
-    """Return σ, that of an exponential by its moments: the equation of `response`."""
+    """Return σ of an exponential flow with these moments: the equation of `response`."""
     z = start / (1 + constant - start) + 16 * (1 - start / constant) ** 2 * constant / (1 + constant)
     if z < 0.02:
         return 1 - z / 4 + z**2 / 40 - z**4 / 5600
@@ -420,9 +422,9 @@ def _area(
     if spec.contact_area != "manifold":
         return spec.contact_area
     made_of = spec.material_of(links[b].name)
-    own = 0.0 if made_of.youngs_modulus is None else (1 - (made_of.poissons_ratio or 0.0) ** 2) / made_of.youngs_modulus
+    of_link = 0.0 if made_of.youngs_modulus is None else (1 - (made_of.poissons_ratio or 0.0) ** 2) / made_of.youngs_modulus
     radius = spec.curvature_radius or 0.5 * float(links[b].size.min())
-    compliance, curvature = own + found.objects[o].compliance, 1 / radius + found.objects[o].curvature
+    compliance, curvature = of_link + found.objects[o].compliance, 1 / radius + found.objects[o].curvature
     if spec.model == "paper":
         return max(patch.area, np.pi * curvature * (0.75 * patch.force * compliance / curvature) ** (2 / 3))
     return max(patch.area, np.pi * (0.75 * patch.force * compliance / curvature) ** (2 / 3))
@@ -481,9 +483,9 @@ def _axis(centre: float, half: float, count: int) -> tuple[np.ndarray, np.ndarra
 
 
 def _output(spec: TemperatureGridSpec, seen: np.ndarray, count: np.ndarray) -> np.ndarray:
-    own = [above[:x, :y, :z] for above, (x, y, z) in zip(seen, count.tolist(), strict=True)]
+    grids = [above[:x, :y, :z] for above, (x, y, z) in zip(seen, count.tolist(), strict=True)]
     if spec.outputs in ("max", "mean"):
-        return np.array([[getattr(np, spec.outputs)(above)] for above in own])
+        return np.array([[getattr(np, spec.outputs)(above)] for above in grids])
     if spec.outputs == "surface":
-        own = [above[_outer(above.shape, np.ones(3), FACES) > 0] for above in own]
-    return np.concatenate([above.ravel() for above in own])[:, None]
+        grids = [above[_outer(above.shape, np.ones(3), FACES) > 0] for above in grids]
+    return np.concatenate([above.ravel() for above in grids])[:, None]

@@ -28,15 +28,15 @@ class Boxes(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """What rows are made of."""
+    """Materials, cells and modes of rows."""
 
     conductivity: Tensor  # k (env, row) [W/(m·K)]
     diffusivity: Tensor  # α = k/(ρc) (env, row) [m²/s]
     capacity: Tensor  # heat capacity of a cell (env, row) [J/K]
     emissivity: Tensor | None  # ε (env, row) [1]; None if nothing radiates
     ends: Vec  # how many exposed faces across an axis cells along it have (row, cell)
-    resistance: Vec  # that between a cell and such a face (env, row) [m²·K/W]: see `losses`
-    film: Vec | None  # what the modes lose at such a face (row,) [W/(m²·K)]; None if nothing
+    resistance: Vec  # resistance between a cell and such a face (env, row) [m²·K/W]: see `losses`
+    film: Vec | None  # heat transfer coefficient of the modes at such a face (row,) [W/(m²·K)]; None: no loss
     film_radiated: Tensor | None  # the share of it that is radiation (row,) [1]
     boxes: Boxes  # the boxes
     modes: tuple[Modes, Modes, Modes]  # modes along each axis
@@ -58,9 +58,9 @@ def rows_of(constants: Constants, patches: ContactPatch, is_smooth: bool) -> Row
     """Return the rows of a sensor.
 
     Args:
-        constants: What `lower` folded.
+        constants: Constants from `lower`.
         patches: The links' contact patches, and the materials there.
-        is_smooth: Whether modes decay as those of the continuous solid.
+        is_smooth: Whether modes decay like the continuous solid's.
     """
     objects, grids = patches.objects, list(patches.topology.grids)
     tables, size = dict(constants), patches.boxes[:, 1] - patches.boxes[:, 0]
@@ -71,7 +71,7 @@ def rows_of(constants: Constants, patches: ContactPatch, is_smooth: bool) -> Row
         tables = {name: _joined(constants[name], table) for name, table in patches.cells.items()}
         size = torch.cat([size, torch.stack([part[grids] for part in objects.size], dim=-1)])
         corner = torch.cat([corner, torch.stack([part[grids] for part in objects.corner], dim=-1)])
-        k, heat = (_beside(own, part[:, grids]) for own, part in ((k, objects.conductivity), (heat, objects.volumetric_heat)))
+        k, heat = (_beside(link, part[:, grids]) for link, part in ((k, objects.conductivity), (heat, objects.volumetric_heat)))
         emissivity = None if emissivity is None else _beside(emissivity, objects.emissivity[:, grids])
     count = planes.split(tables["count"])
     sides = planes.split(size)
@@ -79,7 +79,7 @@ def rows_of(constants: Constants, patches: ContactPatch, is_smooth: bool) -> Row
     boxes = Boxes(planes.split(corner), sides, step, count)
     name = "smooth" if is_smooth else "square"
     ends = planes.vec(tables[f"ends_{axis}"] for axis in "xyz")
-    resistance = (d / (2.0 * k) * (1.0 - own.sum(dim=-1) / (3.0 * n)) for d, n, own in zip(step, count, ends, strict=True))
+    resistance = (d / (2.0 * k) * (1.0 - end.sum(dim=-1) / (3.0 * n)) for d, n, end in zip(step, count, ends, strict=True))
     film, radiated = None, None
     if "film" in constants:
         # The modes of objects lose nothing.
@@ -118,7 +118,7 @@ def of_cells(values: Tensor, axis: int) -> Tensor:
 
 def padded(cells: Tensor, num_cells: tuple[int, int, int]) -> Tensor:
     """Return cells (…, x, y, z) with more of them, of value 0."""
-    lack = [want - found for want, found in zip(num_cells, cells.shape[-3:], strict=True)]
+    lack = [want - size for want, size in zip(num_cells, cells.shape[-3:], strict=True)]
     return pad(cells, (0, lack[2], 0, lack[1], 0, lack[0])) if any(lack) else cells
 
 
@@ -127,11 +127,11 @@ def _beside(links: Tensor, objects: Tensor) -> Tensor:
 
 
 def _joined(links: Tensor, objects: Tensor) -> Tensor:
-    """Return two tables one below the other, each padded to the larger shape; what is not there is 0."""
+    """Return two tables concatenated along rows, each padded with zeros to the larger shape."""
     shape = [max(a, b) for a, b in zip(links.shape[1:], objects.shape[1:], strict=True)]
     parts = []
     for table in (links, objects):
-        lack = [want - found for want, found in zip(shape, table.shape[1:], strict=True)]
+        lack = [want - size for want, size in zip(shape, table.shape[1:], strict=True)]
         parts.append(pad(table, [n for lacking in reversed(lack) for n in (0, lacking)]))
     return torch.cat(parts)
 
@@ -142,8 +142,8 @@ def gained_by_objects(objects: Tensor, where: Topology, nodes: Tensor, grids: Te
     Args:
         objects: Their temperatures, for the shape.
         where: Which object is what.
-        nodes: Gains of those of one temperature (env, node).
-        grids: Gains of those with cells (env, grid, …), padded to the links' cells too.
+        nodes: Gains of objects of one temperature (env, node).
+        grids: Gains of objects with cells (env, grid, …), padded to the links' cells too.
     """
     if where.is_plain and objects.shape[2:].numel() == 1:
         return nodes[:, :, None, None, None]
@@ -181,10 +181,10 @@ def account(
 
     Args:
         objects: Temperatures of their cells (env, object, x, y, z).
-        patches: What they are made of.
+        patches: Contact patches with the objects' materials.
         capacity: Heat capacity of a row's cells (env, row) [J/K].
-        got: What rows got from source, radiation, convection and contact (env, row) each [J].
-        nodes_got: What nodes got from the last three (env, node) each [J].
+        got: Heat of rows from source, radiation, convection and contact (env, row) each [J].
+        nodes_got: Heat of nodes from the last three (env, node) each [J].
         links: Mean temperature of the links (env, link) [K].
     """
     where = patches.topology
@@ -192,20 +192,20 @@ def account(
         return ()
     heat = patches.objects.volumetric_heat * patches.objects.volume
     if where.is_plain:
-        own = objects[:, :, 0, 0, 0]
-        return own, own * torch.where(torch.isfinite(heat), heat, 0.0), *nodes_got
+        temperature = objects[:, :, 0, 0, 0]
+        return temperature, temperature * torch.where(torch.isfinite(heat), heat, 0.0), *nodes_got
     columns: list[tuple[Tensor, ...]] = []
     for i in range(where.num_objects):
         if i in where.lumped:
-            own = objects[:, i, 0, 0, 0]
+            temperature = objects[:, i, 0, 0, 0]
             capacity_of = torch.where(torch.isfinite(heat[:, i]), heat[:, i], 0.0)
-            columns.append((own, own * capacity_of, *(part[:, where.lumped.index(i)] for part in nodes_got)))
+            columns.append((temperature, temperature * capacity_of, *(part[:, where.lumped.index(i)] for part in nodes_got)))
         elif i in where.grids:
             row, cells = where.num_bodies + where.grids.index(i), where.cells[i]
             total = objects[:, i].sum(dim=(-3, -2, -1))
             mean = total / (cells[0] * cells[1] * cells[2])
             columns.append((mean, total * capacity[:, row], *(part[:, row] for part in got[1:])))
         else:  # a link of the sensor, whose own report has its heat
-            own = links[:, where.links[i]]
-            columns.append((own, *[torch.zeros_like(own)] * 4))
+            temperature = links[:, where.links[i]]
+            columns.append((temperature, *[torch.zeros_like(temperature)] * 4))
     return tuple(torch.stack(part, dim=1) for part in zip(*columns, strict=True))

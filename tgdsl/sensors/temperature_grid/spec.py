@@ -28,7 +28,7 @@ Cells = Annotated[tuple[Annotated[StrictInt, Field(ge=1)], ...], Field(min_lengt
 
 
 class HeatSource(SpecModel):
-    """Heat that is made in each link: one of both."""
+    """A heat source in each link: `power` or `flux`."""
 
     power: Annotated[Annotated[float, Quantity("power")] | None, Usual("power", high=100.0)] = None
     """In all of each link, evenly [W]."""
@@ -60,7 +60,7 @@ class TemperatureGridSpec(LinkSpec):
     region: Region = ()
     """Part of each link's surface whose box is divided, such as a geom by its name; default: all of the link's surface."""
     material: MaterialField
-    """What the links are made of: a material by name, or by its numbers."""
+    """Material of the links, by name or by its properties."""
     materials: dict[str, MaterialField] = {}
     """Other materials, by links' names or shell wildcards; the first that matches counts."""
     ambient: Temperature = 22.0
@@ -73,7 +73,7 @@ class TemperatureGridSpec(LinkSpec):
     model: Literal["physical", "paper"] = "physical"
     """`paper`: the formulas as printed, which are unstable and lack the units of a heat flow."""
     source: HeatSource | None = None
-    """Heat that is made in the links; default: none."""
+    """Heat source in the links; default: none."""
     emissivity: Literal["material"] | Annotated[float, Quantity("number", ge=0.0, le=1.0)] | None = None
     """Radiation of the exposed faces and of the objects: `material`, or the links' emissivity [1]; default: none."""
     convection: HeatTransfer | None = None
@@ -127,8 +127,8 @@ class TemperatureGridSpec(LinkSpec):
         return self.ambient if self.temperature is None else self.temperature
 
     def material_of(self, link: str) -> Material:
-        """Return what a link is made of."""
-        return next((own for pattern, own in self.materials.items() if fnmatchcase(link, pattern)), self.material)
+        """Return a link's material."""
+        return next((material for pattern, material in self.materials.items() if fnmatchcase(link, pattern)), self.material)
 
 
 def alternatives(spec: TemperatureGridSpec) -> list[Alternative]:
@@ -245,14 +245,14 @@ def lost_error(
 ) -> float:
     """Return the relative error of the heat that cells have lost after `EARLY`.
 
-    How well cells hold what their faces lose: against the closed form of a box that cools from one temperature.
+    The oracle is the closed form of a box that cools from one temperature:
 
         θ̄ = Π_a Σ_m 4 sin² β/(β (2β + sin 2β)) e^(−β² αt/L²),   β tan β = hL/k                                          [1]
 
-    is the mean of what is left of a box, a product over the axes with exposed faces, L the box's side along one, or half of it
-    if both of its faces are exposed. Cells leave the sum of their own modes. They are compared when two fifths of the heat are
-    lost. Cells begin with an even flow to the face, and the solid with a steeper one: that is what cells too large for Bi =
-    hL/k miss.
+    is the mean remaining temperature of a box, a product over the axes with exposed faces. L is the box's side along one, or
+    half of it if both of its faces are exposed. The cells' value is the sum of their modes. The two are compared when two
+    fifths of the heat are lost. Cells start with an even flow to the face, the solid with a steeper one, which cells too large
+    for Bi = hL/k miss.
 
     Source: Carslaw and Jaeger, *Conduction of Heat in Solids*, 3.11; Incropera et al., 5.5 and 5.8.
 
@@ -269,7 +269,7 @@ def lost_error(
     loss = ratio * step / (1.0 + ratio * step / 2.0 * (1.0 - ends / (3.0 * count)))
     slowest = tables(count[None], size[None], exposed, loss[None])
     rates = [slowest[f"square_{axis}"][0] / step[a] ** 2 for a, axis in enumerate("xyz")]
-    time = EARLY / sum(own.min() for own in rates)
+    time = EARLY / sum(rate.min() for rate in rates)
     ours, exact = 1.0, 1.0
     for a, axis in enumerate("xyz"):
         ours *= float(slowest[f"total_{axis}"][0] ** 2 @ np.exp(-rates[a] * time)) / count[a]

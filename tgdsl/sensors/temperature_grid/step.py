@@ -44,11 +44,11 @@ class Stepped(NamedTuple):
 
 
 def step(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, constants: Constants, dt: Tensor) -> Stepped:
-    """Return what a step does.
+    """Return the gains of one step.
 
     Args:
         cells: Temperatures of the rows' cells above ambient (env, row, x, y, z) [K].
-        nodes: Those of the objects of one temperature (env, node) [K].
+        nodes: Temperatures of the objects of one temperature (env, node) [K].
         rows: Materials of the rows.
         patches: The links' contact patches, and the materials there.
         constants: What `lower` folded.
@@ -56,7 +56,7 @@ def step(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, consta
     """
     inverse = _of_nodes(patches, 1.0 / (patches.objects.volumetric_heat * patches.objects.volume))
     gained, nodes_gained = torch.zeros_like(cells), torch.zeros_like(nodes)
-    # Sums, and no views of what the module overwrites: derivatives are taken of them later.
+    # Sums, not views of buffers that the module overwrites: autograd needs the values later.
     cells, nodes = cells + gained, nodes + nodes_gained
     blown = radiated = source = touched = torch.zeros_like(cells[:, :, 0, 0, 0])
     blown_nodes = radiated_nodes = touched_nodes = torch.zeros_like(nodes)
@@ -69,22 +69,22 @@ def step(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, consta
         nodes_gained, share = losses.lost(nodes, of_nodes, dt)
         glow = nodes_gained * share
         radiated_nodes, blown_nodes = _joules(glow, inverse), _joules(nodes_gained - glow, inverse)
-    made = None
+    generated = None
     if "source" in constants:
-        made = dt * _made(rows, patches, constants) / rows.capacity[..., None, None, None]
-        source = source + made.sum(dim=(-3, -2, -1)) * rows.capacity
+        generated = dt * _source(rows, patches, constants) / rows.capacity[..., None, None, None]
+        source = source + generated.sum(dim=(-3, -2, -1)) * rows.capacity
     if patches.topology.met:
         spread, entered, heat, got = _in_modes(
-            cells + gained, nodes + nodes_gained, rows, patches, constants, dt, inverse, made
+            cells + gained, nodes + nodes_gained, rows, patches, constants, dt, inverse, generated
         )
         touched, nodes_gained = touched + heat, nodes_gained + inverse * got
         touched_nodes = torch.where(inverse > 0, got, 0.0)
     else:
         spread, entered = diffused(cells + gained, rows, constants, dt)
-        if made is not None:
+        if generated is not None:
             late = decays(_exponents(rows, dt), "is_semi_implicit" in constants)[1]
-            more = diffusion.from_modes(diffusion.to_modes(made, rows.modes) * late, rows.modes)
-            spread, entered = spread + (made + more.gained), entered + more.entered
+            more = diffusion.from_modes(diffusion.to_modes(generated, rows.modes) * late, rows.modes)
+            spread, entered = spread + (generated + more.gained), entered + more.entered
     if rows.film_radiated is not None:
         linear = entered * rows.capacity
         radiated, blown = radiated + linear * rows.film_radiated, blown + linear * (1.0 - rows.film_radiated)
@@ -101,26 +101,26 @@ def _in_modes(
     constants: Constants,
     dt: Tensor,
     inverse: Tensor,
-    made: Tensor | None,
+    generated: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return what conduction, linear losses, contact and a source, made in all of the step [K], do at once."""
+    """Return what conduction, linear losses, contact and a constant source [K] do together."""
     is_implicit = "is_semi_implicit" in constants
     less, capacity = decays(_exponents(rows, dt), is_implicit), rows.capacity[..., None, None, None]
     phi, parts = whole(less), diffusion.to_modes(cells, rows.modes)
     mean, change = parts * less[1], parts * less[0]
-    if made is not None:
-        warmed = diffusion.to_modes(made, rows.modes)
+    if generated is not None:
+        warmed = diffusion.to_modes(generated, rows.modes)
         mean, change = mean + warmed * less[2], change + warmed * less[1]
     free = [cells + diffusion.from_modes(part, rows.modes).gained for part in (mean, change)]
-    if made is not None:
-        free = [free[0] + 0.5 * made, free[1] + made]
+    if generated is not None:
+        free = [free[0] + 0.5 * generated, free[1] + generated]
     sides, flow = conduction.Sides(patches.sides, patches.topology.is_plain), dt * patch_flow(patches, rows, constants)
     flows = conduction.step((free[0], free[1]), nodes, rows.capacity, inverse, flow, sides, phi, rows.modes, is_implicit)
-    shows = response(less, flows.sigma[..., None, None, None])  # without what does not decay: 1 and 0
+    shows = response(less, flows.sigma[..., None, None, None])  # without the parts that do not decay, 1 and 0
     heat, rate = flows.heat / capacity, flows.rate / capacity
     change = change + diffusion.to_modes(heat, rows.modes) * shows.end_of_heat
     change = change + diffusion.to_modes(rate, rows.modes) * shows.end_of_rate
-    total = heat if made is None else heat + made
+    total = heat if generated is None else heat + generated
     spread, entered = diffusion.from_modes(change, rows.modes)
     return total + spread, entered, flows.heat.sum(dim=(-3, -2, -1)), flows.nodes
 
@@ -143,15 +143,15 @@ def _surfaces(
     volume = _of_nodes(patches, patches.objects.volume)
     is_finite = torch.isfinite(volume)
     width = planes.power(torch.where(is_finite, volume, 1.0), 1.0 / 3.0)
-    own = losses.Face(
+    face = losses.Face(
         _of_nodes(patches, patches.objects.area) * inverse, width / (6.0 * _of_nodes(patches, patches.objects.conductivity))
     )
     if rows.emissivity is None:
         # Without radiation the modes of links lose all.
         cells = losses.Surfaces(tuple(faces), None, blown, around) if patches.topology.grids else None
-        return cells, losses.Surfaces((own,), None, blown, around)
+        return cells, losses.Surfaces((face,), None, blown, around)
     glowing = rows.emissivity[..., None, None, None], _of_nodes(patches, patches.objects.emissivity)
-    return losses.Surfaces(tuple(faces), glowing[0], blown, around), losses.Surfaces((own,), glowing[1], blown, around)
+    return losses.Surfaces(tuple(faces), glowing[0], blown, around), losses.Surfaces((face,), glowing[1], blown, around)
 
 
 def _of_nodes(patches: ContactPatch, of_objects: Tensor) -> Tensor:
@@ -159,9 +159,9 @@ def _of_nodes(patches: ContactPatch, of_objects: Tensor) -> Tensor:
     return of_objects if where.is_plain else of_objects[:, list(where.lumped)]
 
 
-def _made(rows: Rows, patches: ContactPatch, constants: Constants) -> Tensor:
-    made, more = padded(constants["source"], num_cells(rows)), len(patches.topology.grids)
-    return torch.cat([made, made.new_zeros((more, *made.shape[1:]))]) if more else made
+def _source(rows: Rows, patches: ContactPatch, constants: Constants) -> Tensor:
+    source, more = padded(constants["source"], num_cells(rows)), len(patches.topology.grids)
+    return torch.cat([source, source.new_zeros((more, *source.shape[1:]))]) if more else source
 
 
 def diffused(cells: Tensor, rows: Rows, constants: Constants, dt: Tensor) -> diffusion.Spread:
@@ -169,7 +169,7 @@ def diffused(cells: Tensor, rows: Rows, constants: Constants, dt: Tensor) -> dif
     if "is_semi_implicit" in constants:
         return diffusion.semi_implicit(cells, _exponents(rows, dt), rows.modes)
     return diffusion.spread(
-        cells, [diffusion.along_axis(dt * rate, own) for rate, own in zip(rows.rates, rows.modes, strict=True)]
+        cells, [diffusion.along_axis(dt * rate, basis) for rate, basis in zip(rows.rates, rows.modes, strict=True)]
     )
 
 
@@ -199,15 +199,15 @@ def _by_kernel(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, 
         constants.get("film_radiated"),
         constants.get("emissivity"),
         source,
-        [*(own.vectors for own in rows.modes), *(own.totals for own in rows.modes), *less],
+        [*(basis.vectors for basis in rows.modes), *(basis.totals for basis in rows.modes), *less],
         [objects.volumetric_heat, objects.volume, objects.area, objects.conductivity, objects.emissivity],
         [dt, constants["ambient"]],
         constants.get("convection"),
     )
-    made = torch.zeros_like(got[:, 0])
+    generated = torch.zeros_like(got[:, 0])
     if source is not None:
-        made = made + dt * constants["power"]
-    return Stepped(gained, nodes_gained, (made, *got.unbind(1)), nodes_got.unbind(1))
+        generated = generated + dt * constants["power"]
+    return Stepped(gained, nodes_gained, (generated, *got.unbind(1)), nodes_got.unbind(1))
 
 
 def _inputs(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, constants: Constants, dt: Tensor) -> list[Tensor]:
@@ -248,26 +248,26 @@ def advanced(patches: ContactPatch, context: Context, constants: Constants, stat
     cells, cells_low = state["cells"], state["cells_low"]
     objects = objects_low = cells.new_zeros((cells.shape[0], 0, 1, 1, 1))
     if where.num_objects:
-        most = [max(own[axis] for own in where.cells) for axis in range(3)]
+        most = [max(count[axis] for count in where.cells) for axis in range(3)]
         objects, objects_low = (state[name].reshape(cells.shape[0], -1, *most) for name in ("objects", "objects_low"))
     all_cells = _with_objects(cells, objects[:, grids], rows) if grids else cells
     nodes = objects[:, :, 0, 0, 0] if where.is_plain else objects[:, lumped, 0, 0, 0]
     if "is_paper" in constants:
-        made = _as_printed(all_cells, nodes, objects, rows, patches, constants, context.dt)
+        stepped = _as_printed(all_cells, nodes, objects, rows, patches, constants, context.dt)
     else:
-        made = HEAT_STEP(all_cells, nodes, rows, patches, constants, context.dt)
+        stepped = HEAT_STEP(all_cells, nodes, rows, patches, constants, context.dt)
     is_first = context.is_first[..., None, None, None]
-    links, extra = made.cells[:, : where.num_bodies], made.cells[:, where.num_bodies :]
+    links, extra = stepped.cells[:, : where.num_bodies], stepped.cells[:, where.num_bodies :]
     x, y, z = cells.shape[2:]
     begun = constants["start"] * constants["is_cell"]
     cells, cells_low = _sum(cells, cells_low, links[:, :, :x, :y, :z], begun, is_first)
     if where.num_objects:
-        gained = gained_by_objects(objects, where, made.nodes, extra)
+        gained = gained_by_objects(objects, where, stepped.nodes, extra)
         start = torch.where(patches.objects.has_start > 0, patches.objects.start - constants["ambient"], 0.0)
         begun = start[..., None, None, None] * is_object_cell(objects, where)
         objects, objects_low = _sum(objects, objects_low, gained, begun, is_first)
     calm = context.is_first
-    got, nodes_got = (tuple(torch.where(calm, 0.0, part) for part in parts) for parts in (made.got, made.nodes_got))
+    got, nodes_got = (tuple(torch.where(calm, 0.0, part) for part in parts) for parts in (stepped.got, stepped.nodes_got))
     num = where.num_bodies
     total = cells.sum(dim=(-3, -2, -1)) + cells_low.sum(dim=(-3, -2, -1))
     of_links = tuple(part[:, :num] for part in got)
@@ -286,8 +286,8 @@ def _sum(high: Tensor, low: Tensor, gained: Tensor, begun: Tensor, is_first: Ten
     """Return a compensated sum, or the start (Knuth's two-sum)."""
     more = low + gained
     total = high + more
-    kept = total - high
-    rest = (high - (total - kept)) + (more - kept)
+    added = total - high
+    rest = (high - (total - added)) + (more - added)
     return torch.where(is_first, begun, total), torch.where(is_first, 0.0, rest)
 
 
@@ -300,12 +300,12 @@ def _as_printed(
     constants: Constants,
     dt: Tensor,
 ) -> Stepped:
-    """Return what a step does by the paper's formulas: the objects keep their temperatures."""
+    """Return the gains of a step by the paper's formulas: the objects keep their temperatures."""
     where = patches.topology
     means = cells.sum(dim=(-3, -2, -1)) / is_there(rows).sum(dim=(-3, -2, -1))
-    others = [objects[:, i, 0, 0, 0] if own < 0 else means[:, own] for i, own in enumerate(where.links)]
-    beside = torch.stack(others, dim=1) if others else objects.flatten(1)
-    spread, made, radiated, blown, touched = paper_step(cells, beside, rows, patches, constants, dt)
-    got = tuple(part.sum(dim=(-3, -2, -1)) * rows.capacity for part in (made, radiated, blown, touched))
+    temperatures = [objects[:, i, 0, 0, 0] if link < 0 else means[:, link] for i, link in enumerate(where.links)]
+    beside = torch.stack(temperatures, dim=1) if temperatures else objects.flatten(1)
+    spread, generated, radiated, blown, touched = paper_step(cells, beside, rows, patches, constants, dt)
+    got = tuple(part.sum(dim=(-3, -2, -1)) * rows.capacity for part in (generated, radiated, blown, touched))
     idle = torch.zeros_like(nodes)
-    return Stepped(spread + made + radiated + blown + touched, idle, got, (idle, idle, idle))
+    return Stepped(spread + generated + radiated + blown + touched, idle, got, (idle, idle, idle))

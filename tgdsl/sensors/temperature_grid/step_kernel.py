@@ -136,14 +136,14 @@ def step_kernel(
     is_cell = (cell < NUM)[:, None] & is_pair[None, :]
     there = (cell < NUM)[:, None] & _is_there(box_x, place[0]) & _is_there(box_y, place[1]) & _is_there(box_z, place[2])
     at_cell = pair[None, :] * NUM + cell[:, None]
-    before = tl.load(cells + at_cell, is_cell, 0.0)
+    start = tl.load(cells + at_cell, is_cell, 0.0)
     # Patches.
     size = tl.load(area + pair, is_pair, 0.0)
     pos = (_at(pos_x, pair, is_pair), _at(pos_y, pair, is_pair), _at(pos_z, pair, is_pair))
     normal = (_at(normal_x, pair, is_pair), _at(normal_y, pair, is_pair), _at(normal_z, pair, is_pair))
     shares = _conductances(size, pos, normal, k, volume, box_x, box_y, box_z, place, there)
     whole = tl.sum(shares, axis=0)
-    # What is no number stays none: minima and maxima lose it.
+    # Propagate NaN: minima and maxima drop it.
     rest = 0.0 * (size + pos[0] + pos[1] + pos[2] + normal[0] + normal[1] + normal[2])
     met = whole * (step / (1.0 + whole * _at(series, pair, is_pair))) + rest
     shares *= (1.0 / tl.where(size > 0, whole, 1.0))[None, :]
@@ -166,7 +166,7 @@ def step_kernel(
             _face(ends_y, film, row, place[1], NY, there, box_y[1], k, by_volume, num_there, 1, HAS_FILM),
             _face(ends_z, film, row, place[2], NZ, there, box_z[1], k, by_volume, num_there, 2, HAS_FILM),
         )
-        lost, glowing = _lost(before, faces, linear_share, glow, blowing, around, step)
+        lost, glowing = _lost(start, faces, linear_share, glow, blowing, around, step)
         radiated = tl.sum(glowing, axis=0)
     own_lost, own_radiated = tl.zeros((PAIRS,), tl.float32), tl.zeros((PAIRS,), tl.float32)
     if RADIATES or BLOWS:
@@ -178,11 +178,11 @@ def step_kernel(
         width = tl.exp(tl.log(tl.where(inverse > 0, own_volume, 1.0)) * (1.0 / 3.0))
         own_lost, own_radiated = _lost_by_one(phi, own_exposed, width / (6.0 * own_k), own_glow, blowing, around, step)
     # Without contact: conduction, with linear losses and a source; and what modes show of contact, see `response`.
-    made = tl.zeros((CELLS, PAIRS), tl.float32)
+    generated = tl.zeros((CELLS, PAIRS), tl.float32)
     if HAS_SOURCE:
-        made = tl.load(source + (row[None, :] * NUM + cell[:, None]), there, 0.0) * (step * over)[None, :]
+        generated = tl.load(source + (row[None, :] * NUM + cell[:, None]), there, 0.0) * (step * over)[None, :]
     weight = tl.where(there, (1.0 / num_there)[None, :], 0.0)
-    now = before + lost
+    now = start + lost
     mean = tl.sum(now * weight, axis=0)
     apart = now - mean[None, :]
     none = tl.zeros((CELLS, PAIRS), tl.float32)
@@ -194,19 +194,19 @@ def step_kernel(
     if NUM <= UNROLLED:
         for mode in tl.static_range(0, NUM):
             average, end, entered, by_cell, by_side = _without_contact(
-                average, end, entered, by_cell, by_side, apart, mean, made, shares,
+                average, end, entered, by_cell, by_side, apart, mean, generated, shares,
                 _mode(vectors, totals, decays, mode, row, place, there, NX, NY, NZ), HAS_SOURCE,
             )  # fmt: skip
     else:
         for mode in range(NUM):
             average, end, entered, by_cell, by_side = _without_contact(
-                average, end, entered, by_cell, by_side, apart, mean, made, shares,
+                average, end, entered, by_cell, by_side, apart, mean, generated, shares,
                 _mode(vectors, totals, decays, mode, row, place, there, NX, NY, NZ), HAS_SOURCE,
             )  # fmt: skip
     # Contact: see `conduction`.
     bodies = inverse * _of_env(met, begin, ROWS, PAIRS)
     sigma = _impulsiveness(by_side[0] * met * over + bodies, by_side[1] * met * over + bodies, met > 0)
-    flow, free = shares * met[None, :], (now + (average + 0.5 * made), now + (end + made))
+    flow, free = shares * met[None, :], (now + (average + 0.5 * generated), now + (end + generated))
     heat_of, rate_of, own_touched = _touched(
         free, phi + own_lost, capacity, inverse, flow, shares, by_cell, by_side, sigma, begin, ROWS, PAIRS
     )
@@ -222,7 +222,7 @@ def step_kernel(
                 spread, through, heat_of, rate_of, sigma, _mode(vectors, totals, decays, mode, row, place, there, NX, NY, NZ)
             )
     spread -= (tl.sum(spread, axis=0) - through)[None, :] * weight
-    tl.store(gained + at_cell, (lost + heat_of) + (spread + made), is_cell)
+    tl.store(gained + at_cell, (lost + heat_of) + (spread + generated), is_cell)
     # Accounts.
     at_row = env * (3 * ROWS) + row
     tl.store(got + at_row, (radiated + through * linear_share) * capacity, is_pair)
@@ -286,13 +286,13 @@ def _without_contact(average, end, entered, by_cell, by_side, apart, mean, made,
     end += of_end[None, :] * wave
     entered += of_end * total
     a, b, c, d = a + 1.0, b + 1.0, c + 0.5, d + 1.0 / 6.0
-    squared, own = wave * wave, tl.sum(shares * wave, axis=0)
-    own *= own
+    squared, mean_wave = wave * wave, tl.sum(shares * wave, axis=0)
+    mean_wave *= mean_wave
     by_cell = (
         by_cell[0] + squared * a[None, :], by_cell[1] + squared * b[None, :],
         by_cell[2] + squared * c[None, :], by_cell[3] + squared * d[None, :],
     )  # fmt: skip
-    by_side = by_side[0] + own * a, by_side[1] + own * b, by_side[2] + own * c, by_side[3] + own * d
+    by_side = by_side[0] + mean_wave * a, by_side[1] + mean_wave * b, by_side[2] + mean_wave * c, by_side[3] + mean_wave * d
     return average, end, entered, by_cell, by_side
 
 
@@ -439,9 +439,9 @@ def _along(pos, normal, edge, box, place, is_first_of_others):
     top = number - 0.5
     first, last = about - width, about + width
     covered = _below(_inside(last, top)[None, :] - at) - _below(_inside(first, top)[None, :] - at)
-    before = tl.maximum(0.5 - first, 0.0) - tl.maximum(0.5 - last, 0.0)
+    before_first = tl.maximum(0.5 - first, 0.0) - tl.maximum(0.5 - last, 0.0)
     after = tl.maximum(last - top, 0.0) - tl.maximum(first - top, 0.0)
-    covered += tl.where(at < 1.0, before[None, :], 0.0)
+    covered += tl.where(at < 1.0, before_first[None, :], 0.0)
     covered += tl.where(tl.abs(at - top[None, :]) < 0.25, after[None, :], 0.0)
     shares = covered * (0.5 / width)[None, :]
     start, end = centre - fits, centre + fits

@@ -300,7 +300,7 @@ def _check_flat(sheet: Sheet, plane: Float[np.ndarray, "v 2"]) -> None:
     if flipped:
         raise refused(
             f"the pad's surface folds over: {flipped} of its {len(solid)} triangles are upside down when it is unrolled",
-            "a pad is seen from outside as one layer; select a smaller region, or repair the mesh",
+            "a pad has one outer layer; select a smaller region, or repair the mesh",
         )
     if (crossing := _crossings(plane, igl.boundary_loop_all(sheet.faces))) is not None:
         at = ", ".join(f"{1e3 * x:.3g}" for x in sheet.vertices[crossing])
