@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Int, Shaped
+from jaxtyping import Bool, Shaped
 
 from tgdsl.errors import listed
 from tgdsl.geometry.bvh import query_operations
@@ -203,24 +203,25 @@ def _noise(touch: Explained, sensor: PlannedSensor) -> list[str]:
     return lines
 
 
-def _affected(constants: Mapping[str, np.ndarray], numbers: Mapping[str, Number]) -> Int[np.ndarray, " affected"] | None:
-    """Return the rows in which numbers of a stage have an effect; None if they are all, or if none decides it."""
+def _affected(constants: Mapping[str, np.ndarray], numbers: Mapping[str, Number]) -> Bool[np.ndarray, " row"] | None:
+    """Return in which rows numbers of a stage have an effect; None if they are all, or if none decides it."""
     has_effect = np.zeros(1, dtype=bool)
     for name, number in numbers.items():
         if number.neutral is not None:
             value = constants[name]
             has_effect = has_effect | (value != number.neutral).reshape(-1, value.shape[-1]).any(axis=0)
-    return np.flatnonzero(has_effect) if has_effect.any() and not has_effect.all() else None
+    return has_effect if has_effect.any() and not has_effect.all() else None
 
 
-def _rows(plan: Plan, sensor: PlannedSensor, rows: Int[np.ndarray, " affected"]) -> str:
-    """Return how many rows of a reading these are, and their links where rows are taxels or links."""
-    reading, layout = sensor.readings[0], plan.layout_of(sensor)
-    text = f"{len(rows)} of {reading.num_rows} {reading.rows if reading.rows == 'body' else reading.rows + 's'}"
-    if len(sensor.taxels):
+def _rows(plan: Plan, sensor: PlannedSensor, is_row: Bool[np.ndarray, " row"]) -> str:
+    """Return how many rows of a reading these are, and their links where rows are taxels or bodies."""
+    reading, layout, rows = sensor.readings[0], plan.layout_of(sensor), np.flatnonzero(is_row)
+    name = reading.rows if len(is_row) == reading.num_rows else "taxel"  # probes of a kind that has rows of its own
+    text = f"{len(rows)} of {len(is_row)} {'bodies' if name == 'body' else name + 's'}"
+    if name == "taxel":
         links = [layout.links[i].name for i in np.unique(layout.link_id[rows])]
-    elif len(sensor.links) == reading.num_rows:
-        links = [sensor.links[i].name for i in rows]
+    elif name == "body" and len(layout.bodies) == len(is_row):
+        links = [layout.bodies[i] for i in rows]
     else:
         return text
     return f"{text}: {listed(links, MOST_LINKS)}"
