@@ -104,7 +104,7 @@ def test_geoms_that_cannot_be_looked_up_are_refused():
             'no body "palm"',
         ),
         (GEOMS._replace(names=("floor", "g1", "g2", "b/knob", "c/knob")), '"knob" may be any of the geoms b/knob, c/knob'),
-        (GEOMS._replace(parents=()), 'the contacts of "box" include those of bodies below it: Geoms needs `parents`'),
+        (GEOMS._replace(parents=()), 'the contacts of "box" include bodies below it: Geoms needs `parents`'),
     ):
         with pytest.raises(SimulationError, match=re.escape(message)):
             tgdsl.contacts_by_pair(INPUTS, geoms, **contacts)
@@ -144,7 +144,7 @@ def test_a_world_that_an_engine_does_not_list_is_at_rest():
 
 def test_bodies_of_one_name_are_refused():
     inputs, places = Inputs(("body_pos",), ("box",), (), {}, 0), torch.zeros(1, 2, 4)
-    with pytest.raises(SimulationError, match=re.escape('the scene has 2 bodies "a/box"; give each a name of its own')):
+    with pytest.raises(SimulationError, match=re.escape('the scene has 2 bodies "a/box"; give each a unique name')):
         tgdsl.bodies_by_name(inputs, ["a/box", "a/box"], places[..., :3], places)
     with pytest.raises(SimulationError, match="this module reads body_linvel, expected all arguments"):
         tgdsl.bodies_by_name(Inputs(("body_linvel",), ("box",), (), {}, 0), ["box"], places[:, :1, :3], places[:, :1])

@@ -129,5 +129,5 @@ def test_what_is_not_known_of_a_hand_is_said_before_it_is_touched(tmp_path):
 
 def test_a_log_does_not_know_what_was_commanded(tmp_path):
     log = write_log(tmp_path / "a.npz", random_readings(np.arange(3) * 0.02))
-    with pytest.raises(ObservationError, match=r"policy\[2\] last_action: a log does not hold what the hand was told"):
+    with pytest.raises(ObservationError, match=r"policy\[2\] last_action: a log does not hold the hand's commands"):
         tgdsl.connect(compiled(tmp_path), log)

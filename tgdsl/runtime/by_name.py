@@ -35,8 +35,8 @@ def index_of(name: str, known: Sequence[str], one: str, several: str) -> int:
     if len(nested) == 1:
         return known.index(nested[0])
     if nested:
-        what = f'"{name}" may be any of the {several} {listed(nested)}'
-        raise SimulationError(f"{what}; say which: touch.inputs.renamed({{{name!r}: {nested[0]!r}}})")
+        problem = f'"{name}" may be any of the {several} {listed(nested)}'
+        raise SimulationError(f"{problem}; say which: touch.inputs.renamed({{{name!r}: {nested[0]!r}}})")
     raise SimulationError(f'the scene has no {one} "{name}"; {did_you_mean(name, list(dict.fromkeys(known)), several)}')
 
 
@@ -77,7 +77,7 @@ def bodies_by_name(
     fields = {"body_pos": pos, "body_quat": quat, "body_linvel": linvel, "body_angvel": angvel}
     missing = [name for name in fields if name in inputs.fields and fields[name] is None]
     if missing:
-        raise SimulationError(f"this module reads {listed(missing)}, expected all arguments that these are made of")
+        raise SimulationError(f"this module reads {listed(missing)}, expected all arguments that determine them")
     needs_world = "world" in inputs.bodies and "world" not in names
     index = _body_index(inputs.bodies, (*names, "world") if needs_world else tuple(names), pos.device)
     result = {}
@@ -95,7 +95,7 @@ def bodies_by_name(
 def _body_index(bodies: tuple[str, ...], names: tuple[str, ...], device: torch.device) -> Int[Tensor, " body"]:
     ids = [index_of(body, names, "body", "bodies") for body in bodies]
     if twice := [names[i] for i in ids if names.count(names[i]) > 1]:
-        raise SimulationError(f'the scene has {names.count(twice[0])} bodies "{twice[0]}"; give each a name of its own')
+        raise SimulationError(f'the scene has {names.count(twice[0])} bodies "{twice[0]}"; give each a unique name')
     return torch.tensor(ids, dtype=torch.int64, device=device)
 
 
@@ -112,11 +112,11 @@ class Geoms(NamedTuple):
         if part.kind == "geom":
             return np.array([index_of(part.name, self.names, "geom", "geoms")])
         parents = dict(self.parents)
-        known = tuple(dict.fromkeys((*self.bodies, *parents)))
-        bodies = {known[index_of(part.name, known, "body", "bodies")]}
+        names = tuple(dict.fromkeys((*self.bodies, *parents)))
+        bodies = {names[index_of(part.name, names, "body", "bodies")]}
         if part.kind == "subtree":
             if not parents:
-                raise SimulationError(f'the contacts of "{part.name}" include those of bodies below it: Geoms needs `parents`')
+                raise SimulationError(f'the contacts of "{part.name}" include bodies below it: Geoms needs `parents`')
             below = set(bodies)
             while below := {body for body, parent in parents.items() if parent in below} - bodies:
                 bodies |= below
@@ -210,10 +210,10 @@ def contacts_by_pair(
     is_contact = is_contact & (pairs >= 0).all(dim=-1)
     one, other = pairs.long().clamp(min=0).T
     env = torch.zeros_like(one) if env is None else env.long()
-    # Each contact is of several rows: a geom may be the object's of one pair and the link's of another, or of several objects.
-    found = torch.cat([row_of_geoms[:, one, link_of_geom[other]], row_of_geoms[:, other, link_of_geom[one]]])
+    # A contact may count in several rows: a geom may be object in one pair and link in another, or be part of several objects.
+    row_ids = torch.cat([row_of_geoms[:, one, link_of_geom[other]], row_of_geoms[:, other, link_of_geom[one]]])
     num_layers, bins = len(row_of_geoms), num_envs * rows.num_rows  # one more bin holds contacts of no pair
-    key = torch.where((found >= 0) & is_contact, env * rows.num_rows + found, bins).T
+    key = torch.where((row_ids >= 0) & is_contact, env * rows.num_rows + row_ids, bins).T
     key, shape = key.flatten(), key.shape
     sign = pos.new_ones(2 * num_layers, 1)
     sign[num_layers:] = -1.0  # there the object is the second geom
@@ -228,7 +228,7 @@ def contacts_by_pair(
     if "contact_found" in inputs.fields:
         fields["contact_found"] = pos.new_zeros(bins + 1).index_add_(0, key, torch.ones_like(forces[:, 0]))[:-1]
         fields["contact_found"] = fields["contact_found"].view(num_envs, -1)
-    if wanted := [name for name in SLOT_FIELDS if name in inputs.fields]:
+    if slot_fields := [name for name in SLOT_FIELDS if name in inputs.fields]:
         slotted = {
             "contact_pos": on_link(pos, torch.ones_like(sign)),
             "contact_normal": on_link(normal, sign),
@@ -237,7 +237,7 @@ def contacts_by_pair(
         }
         slot = _ranks(key)
         place = torch.where((key < bins) & (slot < inputs.slots), key * inputs.slots + slot, bins * inputs.slots)
-        for name in wanted:
+        for name in slot_fields:
             filled = pos.new_zeros(bins * inputs.slots + 1, 3).index_copy_(0, place, slotted[name])
             fields[name] = filled[:-1].view(num_envs, -1, inputs.slots, 3)
     return {name: value[:, row_of_pair] for name, value in fields.items()}

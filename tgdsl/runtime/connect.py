@@ -79,7 +79,7 @@ def connect(
         timing: Timing of the serial line. A step waits for a reading as long as two replies may take.
         lockstep: Do not run in real time: the emulator's scene advances by steps, and a log is read as fast as possible. A
             simulation always does this, a real hand never.
-        taxels: The expected taxels, such as those of a policy: another module, its tables, an artefact, a rollout or an id, see
+        taxels: The expected taxels, such as a policy's: another module, its tables, an artefact, a rollout or an id, see
             `tgdsl.check_taxels`.
         scene: A scene, such as a task's, that a simulation or an emulator steps instead of the module's. It is closed with the
             connection, and ignores `keyframe`.
@@ -192,8 +192,8 @@ def _open_simulator(
     if scene is not None:
         return SimulationConnection(touch, _stepping(scene, control_step))
     options |= {"device": source.partition(":")[2] or kind.devices[0], "substeps": 1}
-    known = keyword_options(kind.simulate)
-    sim = kind.simulate(touch, num_envs, **{name: value for name, value in options.items() if name in known})
+    names = keyword_options(kind.simulate)
+    sim = kind.simulate(touch, num_envs, **{name: value for name, value in options.items() if name in names})
     return SimulationConnection(touch, _with_step(sim, control_step))
 
 

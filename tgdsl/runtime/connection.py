@@ -183,7 +183,7 @@ class SourceKind:
 class SimulatorKind(SourceKind):
     """A kind of source that `tgdsl.simulate` can make too."""
 
-    #: default: the simulation that `simulate` makes, of a scene of its own or of a task
+    #: default: the simulation that `simulate` makes, of the module's or a task's scene
     open: Any = field(default=None, kw_only=False)
     devices: tuple[str, ...]  #: types of torch devices that it is the default simulator of: "cpu", "cuda"
     simulate: Callable[..., Any]  #: makes a simulation: `simulate(touch, num_envs, *, device, option, …)`
@@ -193,8 +193,8 @@ class SimulatorKind(SourceKind):
         """Names of the options that it knows."""
         if self.open is not None:
             return keyword_options(self.open)
-        chosen = ("device", "substeps", "model")  # by the source, by `control_step` and by the module
-        return ("num_envs", "control_step", "scene", *(name for name in keyword_options(self.simulate) if name not in chosen))
+        fixed = ("device", "substeps", "model")  # by the source, by `control_step` and by the module
+        return ("num_envs", "control_step", "scene", *(name for name in keyword_options(self.simulate) if name not in fixed))
 
 
 def keyword_options(call: Callable[..., Any]) -> tuple[str, ...]:

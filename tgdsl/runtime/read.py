@@ -42,13 +42,13 @@ def read_mujoco(
         SimulationError: If the scene lacks a body, a joint or an actuator, or several names match one; if `data` was never
             evaluated.
     """
-    own = inputs or touch.inputs
-    reader, geoms = _reader(touch, own, (model,), lambda: (StateReader(own, model, _CPU), model_geoms(model)))
+    named = inputs or touch.inputs
+    reader, geoms = _reader(touch, named, (model,), lambda: (StateReader(named, model, _CPU), model_geoms(model)))
     envs: list[mujoco.MjData] = list(data) if isinstance(data, Sequence) else [data]
     if any(not env.xquat[0].any() for env in envs):  # the world's orientation, which MuJoCo sets at the first evaluation
         raise SimulationError("the poses of this MjData are not computed yet; call mujoco.mj_forward(model, data) first")
     arrays = {name: torch.from_numpy(np.stack([getattr(env, name) for env in envs])) for name in reader.arrays}
-    fields: dict[str, Any] = reader.read(arrays) | _contacts(own, model, geoms, envs)
+    fields: dict[str, Any] = reader.read(arrays) | _contacts(named, model, geoms, envs)
     time = torch.tensor([env.time for env in envs], dtype=torch.float64)
     return SceneState(**fields, time=time).to(touch.device)
 
@@ -98,8 +98,8 @@ def read_warp(
         SimulationError: If the scene lacks a body, a joint or an actuator, or several names match one; if the module is on
             another device; if this version of MuJoCo Warp has other contact arrays.
     """
-    own = inputs or touch.inputs
-    return _reader(touch, own, (mj_model, model, data), lambda: _warp_reader(touch, own, mj_model, model, data))()
+    named = inputs or touch.inputs
+    return _reader(touch, named, (mj_model, model, data), lambda: _warp_reader(touch, named, mj_model, model, data))()
 
 
 def _warp_reader(

@@ -224,8 +224,8 @@ class Recorder:
     The file holds `time` (step,) [s], `ctrl` (step, …, actuator), names of `actuators`, MuJoCo's `qpos` (step, env, nq) after
     the step, the path of the `document`, each reading by its name (step, env, taxel, channel) as float32, and its channels'
     names and units under `<name>:channels` and `<name>:units`. Where its taxels are is under `<name>:link`, `<name>:body`,
-    `<name>:pos` and `<name>:normal` (frame of the body [m]) and `<name>:area` [m²]; of readings of bodies there is
-    `<name>:body` alone, of those with rows of their own the columns of `touch.rows[<name>]`.
+    `<name>:pos` and `<name>:normal` (frame of the body [m]) and `<name>:area` [m²]. Readings of bodies have only
+    `<name>:body`; readings with other rows have the columns of `touch.rows[<name>]`.
     """
 
     def __init__(self, touch: TactileModule, num_steps: int, num_envs: int):

@@ -16,7 +16,7 @@ from tgdsl.runtime.simulators.state_values import NewValues
 BOTH = pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
 CONTROLS = np.random.default_rng(3).normal(size=(6, 2))
 PRESSED = SCENE.replace('pos="0 0 .0299"', 'pos="0 0 .028"')
-SAID = r"^environments had faults and were restarted: {}; this is said once, `fault_counts` counts on$"
+SAID = r"^environments had faults and were restarted: {}; shown once, `fault_counts` counts all faults$"
 
 
 @pytest.fixture(autouse=True)
@@ -248,7 +248,7 @@ def test_a_search_that_runs_out_of_room_is_a_fault_of_its_environment(tmp_path, 
         with pytest.raises(SimulationError, match=rf"^{text} in environments 1: contacts may be wrong; reset them to go on$"):
             sim.step()
     else:
-        with pytest.warns(UserWarning, match=f"in 1 {text}; this is said once"):
+        with pytest.warns(UserWarning, match=f"in 1 {text}; shown once"):
             sim.step()
     assert sim.faults.tolist() == [False, True, False] and sim.fault_counts.tolist() == [0, 1, 0]
     if on_fault != "reset":

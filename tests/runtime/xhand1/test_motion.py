@@ -134,7 +134,7 @@ def test_a_target_outside_its_range_stops_the_hand(value, message):
     with pytest.raises(MotionError, match=message):
         motion.command(target, 1.01, REST)
     assert motion.joints(1.02) is PASSIVE
-    with pytest.raises(MotionError, match="the hand was made passive"):
+    with pytest.raises(MotionError, match="the hand is passive"):
         motion.command(REST, 1.03, REST)
 
 
@@ -226,7 +226,7 @@ def test_a_failure_on_the_line_leaves_the_hand_passive_although_no_reply_is_unde
         emulator.set_faults(faults)
         assert becomes_passive(emulator)
         assert wait_until(lambda: hand.stopped is not None)
-        with pytest.raises(HandError, match="the hand was made passive"):
+        with pytest.raises(HandError, match="the hand is passive"):
             hand.command(REST)
         emulator.set_faults(Faults())
 
@@ -240,7 +240,7 @@ def test_a_hand_that_was_unplugged_while_it_moved_is_passive_when_it_is_back():
         drive(hand, emulator)
         emulator.unplug()
         assert wait_until(lambda: hand.stopped is not None)
-        with pytest.raises((HandDisconnectedError, WatchdogError), match="the hand was made passive"):
+        with pytest.raises((HandDisconnectedError, WatchdogError), match="the hand is passive"):
             hand.command(REST)
         emulator.replug()
         assert becomes_passive(emulator)

@@ -188,9 +188,7 @@ def test_fingertips_by_body(body, finger):
 def test_noise_is_said_not_to_apply(tmp_path):
     warn_of_noise(compiled(tmp_path, AGGREGATES[:1]).plan)
     noisy = compiled(tmp_path, AGGREGATES[:1], depth={"noise": "noisy"})
-    with pytest.warns(
-        UserWarning, match="the noise of depth is that of a simulated sensor: it is not added to what a hand says"
-    ):
+    with pytest.warns(UserWarning, match="the noise of depth is simulated: it is not added to a hand's values"):
         warn_of_noise(noisy.plan)
 
 

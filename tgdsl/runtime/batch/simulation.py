@@ -1,7 +1,7 @@
 """MuJoCo on CPU threads: many environments of the artefact's scene, stepped together.
 
-`mujoco.batch`, which MuJoCo has from 3.17 on, is imported when a simulation is made: to compile, and to read another
-simulator's state, an older MuJoCo will do.
+`mujoco.batch` needs MuJoCo 3.17 and is imported when a simulation starts: compiling, and reading another simulator's state,
+work with an older MuJoCo.
 
 Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them, `slot` contacts per pair.
 """
@@ -66,7 +66,7 @@ class BatchProperties(ObjectProperties):
         self._models = list(self._chosen) if is_apart else None
 
     def use_models(self, models: Sequence[mujoco.MjModel]) -> None:
-        """Give environments other models; those that keep theirs keep their masses and frictions too."""
+        """Replace models of environments; environments with an unchanged model keep their masses and frictions."""
         changed = [env for env, model in enumerate(models) if model is not self._chosen[env]]
         self._chosen = list(models)
         if self._models is not None:
@@ -191,8 +191,8 @@ class ContactSensors:
             fields["contact_netforce"] = np.stack(nets, axis=1)
         fields["contact_found"] = np.stack([sum(sensor.count(data) for sensor in parts) for parts in self._points], axis=1)
         if self._num_slots:
-            shown = [[sensor.read(data) for sensor in parts] for parts in self._points]
-            fields |= _in_world(np.stack([_first_contacts(parts, self._num_slots) for parts in shown], axis=1))
+            rows = [[sensor.read(data) for sensor in parts] for parts in self._points]
+            fields |= _in_world(np.stack([_first_contacts(parts, self._num_slots) for parts in rows], axis=1))
         return {name: torch.from_numpy(np.ascontiguousarray(fields[name])) for name in self._shapes}
 
 
@@ -226,15 +226,15 @@ class _PointSensor:
         if self._margin is None:
             return count
         num = self.read(data)[0].sum(axis=1)
-        return np.where(num < self._num, num, count)  # if all that are shown are contacts, others may be
+        return np.where(num < self._num, num, count)  # if all reported rows are contacts, there may be more
 
     def read(self, data: Float[Array, "env number"]) -> _Shown:
-        shown = data[:, self._place.start : self._place.stop].reshape(len(data), self._num, -1)
-        is_contact = shown[:, :, 0] > 0
+        rows = data[:, self._place.start : self._place.stop].reshape(len(data), self._num, -1)
+        is_contact = rows[:, :, 0] > 0
         if self._margin is not None:
-            distance, force = shown[:, :, self._columns["dist"][0]], shown[:, :, self._columns["force"]]
+            distance, force = rows[:, :, self._columns["dist"][0]], rows[:, :, self._columns["force"]]
             is_contact = is_contact & ((distance < self._margin) | (force != 0).any(axis=-1))
-        return is_contact, shown[:, :, self._values]
+        return is_contact, rows[:, :, self._values]
 
 
 def _first_contacts(parts: Sequence[_Shown], num_slots: int) -> Float[Array, "env slot value"]:
@@ -291,8 +291,8 @@ _DIVERGENCES = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in
 class BatchSimulation(Simulation):
     """Environments in MuJoCo's `Batch` on CPU threads, in float64. `qpos`, `qvel` and `ctrl` share MuJoCo's memory.
 
-    A physics step advances joints, but poses, velocities and contacts stay those of its start. A state is of that instant, so
-    its joints are those from before the step.
+    A physics step advances joints, but leaves poses, velocities and contacts at its start. A state refers to that instant:
+    its joints are the ones before the step.
 
     Attributes:
         batch: MuJoCo's batch: `batch.qpos`, `batch.qvel` and others are live arrays (env, …).
@@ -374,8 +374,8 @@ class BatchSimulation(Simulation):
     def _forward(self, ids: Int[Array, " n"], stage: int) -> None:
         self._run(lambda: self.batch.forward(ids, stage=stage))
         self._instant[ids] = self._arrays["time"][ids]
-        for name, kept in self._kept.items():
-            kept[ids] = self._arrays[name][ids]
+        for name, saved in self._kept.items():
+            saved[ids] = self._arrays[name][ids]
 
     def _advance(self, num_steps: int) -> None:
         self.batch.warning[...] = 0
@@ -383,8 +383,8 @@ class BatchSimulation(Simulation):
         if self._kept:
             if self.drive is not None:
                 self.drive()
-            for name, kept in self._kept.items():
-                kept.copy_(self._arrays[name])
+            for name, saved in self._kept.items():
+                saved.copy_(self._arrays[name])
             self._run(lambda: self.batch.step(nstep=1))
         self._instant.copy_(self._arrays["time"]).sub_(float(self.model.opt.timestep))
         self._faults.note(DIVERGED, torch.from_numpy(self.batch.warning[:, _DIVERGENCES, 1].any(axis=1)))

@@ -1,4 +1,4 @@
-"""A hand that closes on an object: servos on its joints, what does not close held in place, the object between the fingers.
+"""A hand that closes on an object: servos close its joints, the rest is fixed, the object is between the fingers.
 
 Nothing is asked of the hand's own actuators, which may be of any kind, act through tendons or not be there: they, springs and
 dry friction rest. Each joint that closes has a servo whose force is limited to what presses with about `GRIP` times the
@@ -57,7 +57,7 @@ class Movement:
         paths: By body, it and all above it but the world, upward.
         joints: All joints of the trees.
         ends: Open and closed end of each joint that closes the hand and follows no other such joint [rad, of slides m].
-        closing: Joints that close the hand, those that follow such included: each after the one that it follows.
+        closing: Joints that close the hand and their followers, each after its leader.
         held: Joints of the trees that neither close the hand nor follow or lead another that does, nor are in a closed loop.
         hand: Bodies of the smallest subtrees, one of each tree, that hold all that closes; an arm is none of them.
         tips: Bodies with geoms below the joints that close, which have no other such below them.
@@ -72,7 +72,7 @@ class Movement:
         root_of: list[int] = model.body_rootid[model.jnt_bodyid].tolist()
         self.trees = frozenset(int(model.body_rootid[model.body(name).id]) for name in bodies) - {0}
         self.joints = tuple(joint for joint in range(model.njnt) if root_of[joint] in self.trees)
-        # By joint, those that an equality has follow another: that one, and the polynomial's coefficients.
+        # By follower joint of an equality: its leader, and the polynomial's coefficients.
         self._follows: dict[int, tuple[int, Float[np.ndarray, " 5"]]] = {}
         for i in np.flatnonzero((model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & model.eq_active0.astype(bool)):
             if (leader := int(model.eq_obj2id[i])) >= 0:
@@ -97,7 +97,7 @@ class Movement:
 
     @property
     def num_joints(self) -> int:
-        """Number of the hand's hinges and slides, of those that follow another only the ones that close it."""
+        """Number of the hand's hinges and slides; followers count only if they close it."""
         counted = [joint for joint in self.joints if joint in self.ends or joint not in self._follows]
         return sum(self.is_scalar(joint) and self.body_of[joint] in self.hand for joint in counted)
 
@@ -165,8 +165,8 @@ class Sweep:
     def place(self) -> Float[np.ndarray, " 3"] | None:
         """Return where the object's frame lies for a grip as good as any, in the world [m]; None if nowhere clear of the hand.
 
-        First between all fingertips; if it cannot be held there, such as what is smaller than the gaps, between one fingertip
-        and the palm, or two.
+        It tries the middle of all fingertips first. An object that cannot be held there, for example one smaller than the
+        gaps, goes between one fingertip and the palm, or between two.
         """
         best, result = (False, 0, -np.inf), None
         tips = self.movement.tips
@@ -263,7 +263,7 @@ class Closing:
         target: The object's name.
         place: Where its body starts, in the world [m]; None: where the scene has it.
         servos: One for each joint that closes.
-        slack: Joints that follow those that close, by name.
+        slack: Followers of the closing joints, by name.
         held: Hinges and slides that are held, by name.
         resting: Indices of actuators that rest.
         body: The object's body, if that is free.

@@ -99,4 +99,4 @@ class EnvFaults:
         self._has_warned = True
         kinds = ", ".join(text.format(num=num) for text, num in zip(_COUNTS, counts, strict=True) if num)
         problem = "had faults" if self.on_fault == "note" else "had faults and were restarted"
-        warnings.warn(f"environments {problem}: {kinds}; this is said once, `fault_counts` counts on", stacklevel=4)
+        warnings.warn(f"environments {problem}: {kinds}; shown once, `fault_counts` counts all faults", stacklevel=4)

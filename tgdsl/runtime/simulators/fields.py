@@ -26,11 +26,11 @@ _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 class StateReader:
-    """Gathers bodies, joints and actuators of a module from arrays (env, …), each field a tensor of its own.
+    """Gathers a module's bodies, joints and actuators from arrays (env, …); each field is a new tensor.
 
     Attributes:
         arrays: Names of the arrays that it reads.
-        moved: Those whose values before the last physics step are of the poses' instant.
+        moved: Names of the arrays whose values before the last physics step belong to the poses' instant.
     """
 
     def __init__(self, inputs: Inputs, model: mujoco.MjModel, device: torch.device):

@@ -40,8 +40,8 @@ PER_ENV: Mapping[str, tuple[str, ...]] = {"mass": MASS_FIELDS, "friction": ("geo
 class SharedMeshModels(SceneModels):
     """The models of a scene for simulators that share meshes among environments.
 
-    MuJoCo makes the hulls of meshes that some geom collides with. Here a spare body, the last one, holds every mesh of every
-    variant, so that meshes and hulls are the same whatever is chosen. Without such meshes the models are those of the scene.
+    MuJoCo builds convex hulls only for meshes of colliding geoms. Here a spare last body holds every mesh of every variant:
+    all choices share meshes and hulls. Without such meshes the models are unchanged.
     """
 
     def _compiled(self, choices: Mapping[str, Choice]) -> mujoco.MjModel:
@@ -107,7 +107,7 @@ class EnvObjects:
         return [self.scenes.model({name: Choice(v)}) for name, v in each_variant], is_open
 
     def models(self) -> list[mujoco.MjModel]:
-        """Return each environment's model; those that are alike share one."""
+        """Return each environment's model; equal choices share one."""
         return self.scenes.models(self._choices)
 
     def _tabulate(self) -> None:
@@ -226,9 +226,9 @@ class ObjectProperties(ABC):
         mass: Mapping[str, Numbers] | None = None,
         friction: Mapping[str, Numbers] | None = None,
     ) -> None:
-        """Change masses and frictions of objects in some environments (default: all), for good; nothing else moves.
+        """Change masses and frictions of objects in some environments (default: all), permanently; no state changes.
 
-        What MuJoCo derives of a mass follows. On a GPU nothing waits, and the simulation has to be made with
+        Fields that MuJoCo derives from masses are updated. On a GPU nothing waits, and the simulation needs
         `per_env=("mass", "friction")`.
 
         Args:
@@ -237,8 +237,8 @@ class ObjectProperties(ABC):
             friction: Coefficient of sliding friction of all geoms, by name: one number, or (env,).
 
         Raises:
-            SimulationError: If there is no such object or environment, a number on the host is out of range, or environments
-                cannot have this of their own.
+            SimulationError: If there is no such object or environment, a number on the host is out of range, or all
+                environments share the property.
         """
         mask = env_mask(env_ids, self._num_envs, self._device)
         masses = {name: self._rows(f"mass of {name}", value, True) for name, value in (mass or {}).items()}
@@ -305,7 +305,7 @@ def refuse_other_fields(given: Mapping[str, Tensor], known: Mapping[str, Tensor]
     """Raise an error for fields that environments do not have, or of another shape."""
     for name, value in given.items():
         if name not in known or tuple(known[name].shape) != tuple(value.shape):
-            raise SimulationError(f'environments cannot have a "{name}" of shape {tuple(value.shape)} of their own')
+            raise SimulationError(f'environments have no field "{name}" of shape {tuple(value.shape)}')
 
 
 def _rigid_object(model: mujoco.MjModel, name: str, bodies_of: Mapping[str, str]) -> RigidObject:
@@ -325,7 +325,7 @@ def _rigid_object(model: mujoco.MjModel, name: str, bodies_of: Mapping[str, str]
         above.append(parent)
         parent = int(model.body_parentid[parent])
     if not body or not model.body_mass[bodies].sum() > 0:
-        raise SimulationError(f'"{name}" has no mass of its own that could be changed')
+        raise SimulationError(f'"{name}" has no mass that could be changed')
     dofs = int(model.body_dofadr[body]) + np.arange(int(model.body_dofnum[body]))
     below = [i for i in range(body + 1, model.nbody) if model.body_rootid[i] == model.body_rootid[body]]
     is_tree = model.body_rootid[body] == body and set(below) <= set(bodies) and not model.dof_armature[dofs].any()

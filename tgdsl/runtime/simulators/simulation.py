@@ -82,7 +82,7 @@ class SimOptions(TypedDict, total=False):
 
 
 class SubstepStates:
-    """Copies of the states after each physics step of the last control step but for the last one."""
+    """Copies of the states after all physics steps of a control step except the last."""
 
     def __init__(self, wanted: int):
         self.are_wanted, self._wanted = wanted > 1, wanted
@@ -133,24 +133,24 @@ class SubstepStates:
 class Simulation(ABC):
     """Environments of one model, read by one module.
 
-    **The instant of a state.** As with `mj_step`, after `step` poses, velocities and contacts are those at the start of the
-    last physics step, and `state`, `read`, `watched` and `time` are of that instant, joints included: with `substeps=1` the
-    instant before the step. After `reset`, `set_state` and `forward` they are of where the environments are. `qpos`, `qvel`
-    and `ctrl` are live tensors, and of now.
+    **The instant of a state.** As with `mj_step`, `step` leaves poses, velocities and contacts at the start of the last
+    physics step. `state`, `read`, `watched` and `time` refer to that instant, joints included: with `substeps=1` the instant
+    before the step. After `reset`, `set_state` and `forward` they refer to the present. `qpos`, `qvel` and `ctrl` are live
+    tensors and always hold present values.
 
-    A module with state remembers each environment's episode: one simulation at a time reads it, from when it is made until it
-    is closed or garbage-collected.
+    A module with state remembers each environment's episode. One simulation at a time reads it, until it is closed or
+    garbage-collected.
 
     An engine implements the abstract methods; its `_start` sets `_arrays`, `_sources`, `_instant`, `_faults`, `_table`
     and `properties`.
 
     Attributes:
-        model: The compiled scene; where objects differ between environments, that of the first.
+        model: The compiled scene; where objects differ between environments, the first environment's.
         substeps: Physics steps per control step.
         properties: Masses and frictions of objects, which may differ between environments.
         heat: Temperatures and materials of objects that hold heat, in live tensors.
-        drive: Is called before each physics step, and may write into `qpos`, `qvel`, `ctrl` and the other live tensors: an
-            actuator model that MuJoCo lacks. It is captured with the step on a GPU, so it must not wait for it there.
+        drive: Called before each physics step; may write into `qpos`, `qvel`, `ctrl` and the other live tensors: an
+            actuator model that MuJoCo lacks. A GPU captures it with the step, so it must not synchronise with the GPU.
     """
 
     OPTIONS: ClassVar[tuple[str, ...]]  #: the options of `SimOptions` that this engine knows
@@ -163,7 +163,7 @@ class Simulation(ABC):
     drive: Callable[[], None] | None = None
     _device: torch.device
     _arrays: Mapping[str, Tensor]  # live, by MuJoCo's names: at least `INTEGRATED`
-    _sources: Mapping[str, Tensor]  # the arrays of the readers, those that a step moves on as they were at the state's instant
+    _sources: Mapping[str, Tensor]  # arrays of the readers at the state's instant; copies where a step changes them
     _instant: Float[Tensor, " env"]
     _faults: EnvFaults
     _table: StateTable
@@ -223,7 +223,7 @@ class Simulation(ABC):
 
     @property
     def arrays(self) -> Mapping[str, Tensor]:
-        """Live tensors (env, …) of MuJoCo's arrays by their names in `mjData`: at least those that it integrates."""
+        """Live tensors (env, …) of MuJoCo's arrays by their names in `mjData`: at least the integrated ones."""
         return self._arrays
 
     @property
@@ -262,25 +262,25 @@ class Simulation(ABC):
 
     @property
     def faults(self) -> Bool[Tensor, " env"]:
-        """Environments with a fault that wait for a reset; with `on_fault="reset"` those that the last step has restarted."""
+        """Environments with a fault that wait for a reset; with `on_fault="reset"`, restarted by the last step."""
         return self._faults.mask
 
     @property
     def fault_counts(self) -> Int[Tensor, " env"]:
-        """How many times each environment has had a fault since the simulation was made."""
+        """Number of faults in each environment since the simulation began."""
         return self._faults.counts.clone()
 
     def step(self, control: Control = None) -> None:
         """Advance all environments by one control step; see the class for the instant that `state` then is of.
 
         Args:
-            control: Actuator controls, (env, actuator) or (actuator,) for all alike; default: as they were. Those on a GPU
-                are checked there. MuJoCo clips them to their ranges; one on the host that is far beyond is warned of.
+            control: Actuator controls, (env, actuator), or (actuator,) for all environments; default: unchanged. Controls on
+                a GPU are checked there. MuJoCo clips them to their ranges; host values far beyond them cause a warning.
 
         Raises:
-            SimulationError: If controls do not fit, or a pool of MuJoCo Warp was too small; and with `on_fault="raise"` if
-                controls are not finite or an environment has diverged. The other environments have then made their step. On a
-                GPU as soon as it is known.
+            SimulationError: If controls do not fit, or a pool of MuJoCo Warp was too small; with `on_fault="raise"` also if
+                controls are not finite or an environment diverged. The other environments have then made their step. On a
+                GPU a later call may raise it.
         """
         self._begin_step(control)
         if not self._earlier.are_wanted:
@@ -319,9 +319,9 @@ class Simulation(ABC):
             yield state
 
     def state(self) -> SceneState:
-        """Return what the module wants on its device, all of one instant (see the class); `dt` is that of a control step.
+        """Return the module's inputs at one instant (see the class), on its device; `dt` is the control step.
 
-        If it has sensors that are advanced at each physics step, the states after the earlier ones are in `substeps`.
+        For sensors that advance at each physics step, `substeps` holds the states after the earlier physics steps.
         """
         self._refuse_if_closed()
         return self._earlier.added_to(self._start_contacts.applied_to(self._state(self.control_step)))
@@ -329,8 +329,8 @@ class Simulation(ABC):
     def read(self, env_ids: EnvIds | None = None) -> dict[str, Tensor]:
         """Return the module's readings of the present state: `touch(state())`, for some environments (default: all).
 
-        The others' noise, delays and histories stay where they are, and their rows are as they were returned before: read
-        all after a step, and after a reset those that were reset.
+        The other environments' noise, delays and histories do not advance, and their rows repeat the last readings. Read all
+        environments after a step, and the reset ones after a reset.
         """
         if env_ids is None:
             return self._touch(self.state())
@@ -380,18 +380,18 @@ class Simulation(ABC):
     def set_state(self, env_ids: EnvIds | None = None, **values: Unpack[StateValues]) -> None:
         """Put some environments (default: all) into a state; their time and the module's memory go on.
 
-        What follows from it is evaluated, as `mj_forward` does. Nothing of the other environments changes.
+        Derived quantities are evaluated as by `mj_forward`. The other environments do not change.
 
         Args:
             env_ids: Indices, or a boolean mask over environments.
-            **values: MuJoCo's arrays of the state (`StateValues`); the others stay. Each has one row for all environments
-                alike, or with indices a row for each in their order, or else (env, …), of which the chosen rows are taken.
-                Quaternions are brought to unit length by MuJoCo's rule (`mju_normalize4`).
+            **values: MuJoCo's arrays of the state (`StateValues`); the rest stay. Each is one row for all environments, a row
+                per index in their order, or (env, …) with a mask, whose other rows are ignored. Quaternions are normalised
+                by MuJoCo's rule (`mju_normalize4`).
 
         Raises:
             SimulationError: If there are no such environments or arrays, a shape does not fit, or numbers on the host are not
-                finite or hold a quaternion of length 0; nothing has changed. On a GPU such environments keep what they had
-                and have a fault.
+                finite or hold a quaternion of length 0; nothing has changed. On a GPU such environments keep their state and
+                have a fault.
         """
         self._refuse_if_closed()
         new, mask = self._table.rows(values, env_ids), env_mask(env_ids, self.num_envs, self._device)
@@ -418,10 +418,10 @@ class Simulation(ABC):
         temperatures: Mapping[str, Values] | None = None,
         materials: Mapping[str, Values] | None = None,
     ) -> None:
-        """Choose what objects are like in some environments (default: all), and restart these; resets keep the choice.
+        """Choose variants and sizes of objects in some environments (default: all), and restart these; resets keep the choice.
 
         At first, environment i has variant i modulo their number. MuJoCo compiles one model per distinct choice: for a cube in
-        the XHand1's palm, 10 ms; on the CPU each is kept and takes 3 MB.
+        the XHand1's palm, 10 ms; on the CPU each model is cached and takes 3 MB.
 
         Args:
             variants: Which variant of an object these environments have: (env,) integers, or one for all.
@@ -447,15 +447,15 @@ class Simulation(ABC):
         self.reset(ids)
 
     def repeated(self, body: Callable[[], T]) -> Callable[[], T]:
-        """Return work that is done again and again on the same tensors, such as a step, its reading and resets.
+        """Return a callable for work that repeats on the same tensors, such as a step, its reading and resets.
 
-        On a GPU its third call captures it as one CUDA graph, which is replayed from then on: what it returns is then in the
-        same tensors each time. It must not ask the GPU for a value, nor branch on one.
+        On a GPU its third call captures one CUDA graph, and later calls replay it: results are then in the same tensors each
+        time. It must not copy a value from the GPU, nor branch on one.
         """
         return body
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of all that the future of the environments follows from, but for the module's own `state_dict`."""
+        """Return copies of the environments' whole state; the module's is in its own `state_dict`."""
         result = self._saved_arrays() | {f"properties/{name}": value for name, value in self.properties.fields().items()}
         start = self._start_contacts
         if start.is_placed is not None:
@@ -522,7 +522,7 @@ class Simulation(ABC):
 
     @abstractmethod
     def _begin_episodes(self, mask: Bool[Tensor, " env"], new: NewValues, *, finds_contacts: bool) -> None:
-        """Restart environments with values, but for the module; without a look for contacts, evaluate poses and velocities."""
+        """Restart environments with values, without the module. Unless `finds_contacts`, skip collision and forces."""
 
     @abstractmethod
     def _put(self, mask: Bool[Tensor, " env"], new: NewValues) -> None:
@@ -592,7 +592,7 @@ def _refuse_unfit(touch: TactileModule, num_envs: int, options: SimOptions) -> N
     if (other := _reader_of(touch)) is not None:
         raise SimulationError(
             f"this module is read by a simulation of {other.num_envs} environments, whose state it holds; `close` that one, or "
-            "give this one a module of its own: tgdsl.compile(...) again, or copy.deepcopy(touch)"
+            "give this one another module: tgdsl.compile(...) again, or copy.deepcopy(touch)"
         )
     if touch.num_envs not in (None, num_envs):
         problem = f"this module holds the state of {touch.num_envs} environments, and num_envs is {num_envs}"

@@ -152,9 +152,9 @@ def control_tensor(control: Tensor | np.ndarray, num_envs: int, num_actuators: i
 def write_controls(
     control: Tensor | np.ndarray, ctrl: Float[Tensor, "env actuator"], refuses_unfinite: bool
 ) -> Bool[Tensor, "*env"]:
-    """Write controls in place where they are finite; return the environments where they are not, or for all whether they are.
+    """Write controls in place where they are finite; return where they are not, () if one row is for all environments.
 
-    Those on a GPU are looked at there; those of the host are refused if they are not finite and `refuses_unfinite`.
+    Controls on a GPU are checked there. If `refuses_unfinite`, host controls that are not finite raise an error.
     """
     values = control_tensor(control, *ctrl.shape)
     is_on_host = not (values.is_cuda and ctrl.is_cuda)
@@ -179,7 +179,7 @@ def warn_of_range(control: Tensor | np.ndarray, model: mujoco.MjModel) -> bool:
     env, i = far[0]
     where = f"environment {env}" if len(values) > 1 else "all environments"
     problem = f'control of actuator "{model.actuator(int(i)).name}" is {values[env, i]:g} in {where}'
-    warnings.warn(f"{problem}, and MuJoCo clips it to [{low[i]:g}, {high[i]:g}]; this is said once", stacklevel=4)
+    warnings.warn(f"{problem}, and MuJoCo clips it to [{low[i]:g}, {high[i]:g}]; shown once", stacklevel=4)
     return True
 
 
@@ -210,9 +210,9 @@ class StartContacts:
         """Note environments that were placed, and their contacts: "none", or fields of a state by name, the others zero."""
         if isinstance(contacts, str) and contacts != "none":
             raise SimulationError(f'contacts is "{contacts}"; {did_you_mean(contacts, ("evaluate", "none"), "choices")}')
-        given = {} if isinstance(contacts, str) else {n: self._fitting(n, contacts[n], chosen) for n in contacts}
-        for name in {**self.values, **given}:
-            old, new = self.values.get(name), given.get(name)
+        fields = {} if isinstance(contacts, str) else {n: self._fitting(n, contacts[n], chosen) for n in contacts}
+        for name in {**self.values, **fields}:
+            old, new = self.values.get(name), fields.get(name)
             new = torch.zeros_like(old) if new is None else new  # pyright: ignore[reportArgumentType]
             old = torch.zeros_like(new) if old is None else old
             self.values[name] = torch.where(broadcast_over(chosen, new), new, old.to(new.dtype))

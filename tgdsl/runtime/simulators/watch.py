@@ -48,7 +48,7 @@ class BodyMotion(NamedTuple):
 
 @dataclass(frozen=True)
 class Watched:
-    """What was looked at, of one instant, in world axes."""
+    """Values of the elements that a `Watch` names, at one instant, in world axes."""
 
     watch: Watch  # the names, in the order of the tensors
     body_pos: Float[Tensor, "env body 3"]  # position of each body's frame [m]
@@ -84,8 +84,8 @@ class WatchReader:
         of_sites = [_carrier(model, int(site)) for site in sites]
         bodies = tuple(dict.fromkeys((*watch.bodies, *of_sites)))
         fields = (*_BODY_FIELDS, *_JOINT_FIELDS)
-        wanted = Inputs(fields, bodies, (), {}, 0, joints=watch.joints, actuators=watch.actuators)
-        self.reader, self._watch = StateReader(wanted, model, device), watch
+        inputs_of_watch = Inputs(fields, bodies, (), {}, 0, joints=watch.joints, actuators=watch.actuators)
+        self.reader, self._watch = StateReader(inputs_of_watch, model, device), watch
         self._carriers = torch.tensor([bodies.index(name) for name in of_sites], dtype=torch.int64, device=device)
         self._site_pos, self._site_quat = (torch.from_numpy(v[sites]).to(device) for v in (model.site_pos, model.site_quat))
         self._pairs = torch.tensor([_pair(inputs, pair) for pair in watch.pairs], dtype=torch.int64, device=device)
@@ -95,11 +95,11 @@ class WatchReader:
         return len(self._pairs) > 0
 
     def read(self, arrays: Mapping[str, Tensor]) -> SceneState:
-        """Return bodies and joints, those that carry sites included."""
+        """Return bodies and joints, including the bodies that carry sites."""
         return SceneState(**self.reader.read(arrays))  # pyright: ignore[reportArgumentType]
 
     def watched(self, values: SceneState, state: SceneState | None) -> Watched:
-        """Return what was looked at, from what `read` has returned and, for pairs, the module's state of that instant."""
+        """Return the watched values, from the result of `read` and, for pairs, the module's state at that instant."""
         fields: dict[str, Tensor] = {name: getattr(values, name) for name in (*_BODY_FIELDS, *_JOINT_FIELDS)}
         pos, quat, num = fields["body_pos"], fields["body_quat"], len(self._watch.bodies)
         site_pos, site_quat = pos[:, :0], quat[:, :0]

@@ -41,7 +41,7 @@ def contact_force_function(mjw: Any) -> Any:
 
 
 def constraint_contact_bit(mjw: Any) -> int:
-    """Return the bit of `Contact.type` of contacts that carry force, rather than those that only sensors look for.
+    """Return the bit of `Contact.type` for contacts with constraints; contacts for sensors alone lack it.
 
     `Contact.type` is public, the enumeration of its values is not.
     """
@@ -67,9 +67,9 @@ _VECTORS = ("contact_pos", "contact_normal", "contact_force", "contact_torque", 
 class PairContacts:
     """Contacts of the pairs that a module needs, on the device, with the fields that it needs.
 
-    Pairs of the same link whose objects have the same geoms share one search. Contacts fill slots in no certain order; if there
-    are more than slots, which are kept is not certain either, but the net force is that of all. Contacts that a `gap` adds
-    beyond the margin carry no force, and are none.
+    Pairs of the same link whose objects have the same geoms share one search. Contacts fill slots in arbitrary order; if there
+    are more than slots, an arbitrary subset stays, but the net force includes all. Contacts that a `gap` adds beyond the margin
+    carry no force and do not count.
     """
 
     # live tensors (env, row, …) of the fields of a state, float32; a row is a link and an object's geoms. Where slots are
@@ -115,13 +115,13 @@ class PairContacts:
         self._launch(self._kernel, dim=warp_data.naconmax, inputs=inputs, outputs=self._outputs)
 
     def read(self) -> dict[str, Float[Tensor, "env pair ..."]]:
-        """Return the fields that are wanted, each a tensor of its own."""
+        """Return the requested fields as new tensors."""
         rows = self._row_of_pair
         return {name: self.arrays[name].clone() if rows is None else self.arrays[name][:, rows] for name in self._fields}
 
 
 def foreign_sensors(model: mujoco.MjModel, inputs: Inputs) -> Int[np.ndarray, " sensor"]:
-    """Return the indices of a model's sensors, those left out that would find a module's contacts."""
+    """Return the indices of a model's sensors, without the sensors of a module's contacts."""
     parts = [(pair, i) for pair in inputs.pairs for i in range(len(inputs.touching(pair)))]
     ours = {name for pair, i in parts for name in contact_sensor_names(pair, i)}
     is_contact = model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT

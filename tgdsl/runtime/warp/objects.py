@@ -1,4 +1,4 @@
-"""Objects that differ between environments, as fields of MuJoCo Warp's model that each environment has of its own.
+"""Objects that differ between environments, as batched fields of MuJoCo Warp's model.
 
 Shapes: `env` environments, `object` objects of the module's `inputs.objects`.
 """
@@ -52,14 +52,14 @@ IGNORED_FIELDS = {
 }
 """Fields that an object's variant and size decide too, and why no environment needs its own."""
 FAR = 1e6
-"""Distance [m] from the scene where geoms that an environment lacks have their bounding boxes, so that nothing meets them."""
+"""Distance [m] from the scene to the bounding boxes of geoms that an environment lacks: out of reach of all collisions."""
 
 
 class WorldObjects:
-    """What the objects of `inputs.objects` are like in each environment, as MuJoCo Warp's model has it.
+    """Variants and sizes of `inputs.objects` in each environment, as fields of MuJoCo Warp's model.
 
-    Types of geoms are shared by all environments: of the geoms that an object has in any variant, those that an environment
-    lacks weigh nothing and do not collide.
+    All environments share the geoms of all variants. Geoms of other variants than an environment's weigh nothing and do not
+    collide.
     """
 
     def __init__(self, chosen: EnvObjects, inputs: Inputs):
@@ -89,7 +89,7 @@ class WorldObjects:
         return self._scenes.model(dict(zip(self._names, self._choices(env), strict=True)))
 
     def _choices(self, env: int) -> tuple[Choice, ...]:
-        """Return what each object is like in one environment."""
+        """Return each object's choice in one environment."""
         results = []
         for i, name in enumerate(self._names):
             x, y, z = self._chosen.object_size[env, i].tolist()
@@ -98,13 +98,13 @@ class WorldObjects:
         return tuple(results)
 
     def _row(self, choices: tuple[Choice, ...]) -> Row:
-        """Return the fields that environments with some choices have of their own."""
+        """Return the batched fields of environments with these choices."""
         model = self._scenes.models([dict(zip(self._names, choices, strict=True))])[0]
         self._check_shared(model)
         row = {name: np.array(getattr(model, name)) for name in OBJECT_FIELDS}
         for geom in np.flatnonzero([is_absent(model, geom) for geom in range(model.ngeom)]):
             row["geom_rbound"][geom] = -FAR  # below every plane
-            # Each in a place of its own, or two that are lacking would meet there.
+            # Each at a different place: absent geoms must not meet each other.
             row["geom_aabb"][geom] = [FAR * (1 + geom)] * 3 + [0.0] * 3
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)

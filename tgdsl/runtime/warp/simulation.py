@@ -69,7 +69,7 @@ class Faults(EnvFaults):
                 torch.maximum(self._peak, self._arrays[name].abs().amax(dim=1), out=self._peak)
 
     def update(self) -> Bool[Tensor, " env"]:
-        """Count faults that are new; return which environments have any of their own."""
+        """Count new faults; return which environments have any, full pools excluded."""
         self.note(DIVERGED, ~(self._peak < _LARGEST))
         self.note(NO_ROOM, (self._arrays["overflow"] & _HORIZON) != 0)
         self._peak.zero_()
@@ -328,9 +328,8 @@ class WarpSimulation(Simulation):
             self._faults.warn_once(totals)
 
     def _physics(self, num_steps: int) -> None:
-        """Advance all environments by some physics steps, and restart those that shall not wait: for a `GraphedCall`."""
-        # Poses and contacts are then those at the start of the last step. Only there are sensors evaluated, unless some of
-        # them remember earlier steps.
+        """Advance all environments by some physics steps; with `on_fault="reset"`, restart faulty ones: for a `GraphedCall`."""
+        # Poses and contacts stay at the start of the last step. Sensors are evaluated only there, unless some have a history.
         whole = self.warp_model.opt.disableflags
         idle = whole if self.warp_model.nhistory else whole | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         try:
@@ -339,13 +338,13 @@ class WarpSimulation(Simulation):
                 if self.drive is not None:
                     self.drive()
                 if not i:
-                    for name, kept in self._kept.items():
-                        kept.copy_(self._arrays[name])
+                    for name, saved in self._kept.items():
+                        saved.copy_(self._arrays[name])
                 self._mjw.step(self.warp_model, self.warp_data)
                 self._faults.check_divergence()
         finally:
             self.warp_model.opt.disableflags = whole
-        # MuJoCo Warp's integrators leave contacts and constraint forces as its last `forward` found them.
+        # MuJoCo Warp's integrators leave contacts and constraint forces as computed by its last `forward`.
         self._pairs.update(self.warp_model, self.warp_data)
         self._is_stale.zero_()
         is_faulty = self._faults.update()
@@ -366,7 +365,7 @@ class WarpSimulation(Simulation):
             self._posing()
 
     def _put(self, mask: Bool[Tensor, " env"], new: NewValues) -> None:
-        """Write values into the state of some environments; those that cannot be used are left out and noted."""
+        """Write values into the state of some environments; skip environments with bad values and note the fault."""
         with torch.no_grad():
             is_put = mask
             if new.is_bad is not None:
@@ -401,7 +400,7 @@ class WarpSimulation(Simulation):
             self._refresh()
 
     def _evaluate_stale(self) -> None:
-        """Evaluate all environments where they are now; those that are not stale keep their earlier instant."""
+        """Evaluate all environments at their present state; environments that are not stale keep their earlier instant."""
 
         def evaluate() -> None:
             for _ in range(2 if self._has_loops else 1):
@@ -423,7 +422,7 @@ class WarpSimulation(Simulation):
         self._is_stale &= ~self._is_reset
 
     def _evaluate_rows(self, is_new: Bool[Tensor, " env"], arrays: Mapping[str, Tensor], evaluate: Callable[[], None]) -> None:
-        """Evaluate all environments, give those that are not new back what they had, and take the joints of the new ones."""
+        """Evaluate all environments, restore `arrays` where not `is_new`, and save the joints of the new ones."""
         filled = [array for array in arrays.values() if array.numel()]
         earlier = [torch.empty_like(array) for array in filled]
         copy_each(earlier, filled)
@@ -431,8 +430,8 @@ class WarpSimulation(Simulation):
         is_old = ~is_new
         for array, old in zip(filled, earlier, strict=True):
             put_rows(array, is_old, old)
-        for name, kept in self._kept.items():
-            put_rows(kept, is_new, self._arrays[name])
+        for name, saved in self._kept.items():
+            put_rows(saved, is_new, self._arrays[name])
 
     def _leave_out_sensors(self, wp: Any, model: mujoco.MjModel, inputs: Inputs) -> None:
         """Keep MuJoCo Warp from evaluating the sensors that `contacts` stands in for; with no others, from looking for any."""

@@ -98,7 +98,7 @@ class WarpStream:
                 ):
                     result = body()
             except RuntimeError as error:
-                raise SimulationError(f"no CUDA graph can be made of this ({error}); graph=False does without") from error
+                raise SimulationError(f"this cannot be captured as a CUDA graph ({error}); set graph=False") from error
             finally:
                 self.is_in_own_graph = False
         return graph, result
@@ -139,7 +139,7 @@ class GraphedCall(Generic[T]):
         self.forget()
 
     def forget(self) -> None:
-        """Forget what was captured: it is captured again."""
+        """Drop the graph; later calls capture again."""
         self._eager_calls = 0
         self._captured: tuple[torch.cuda.CUDAGraph, T] | None = None
 

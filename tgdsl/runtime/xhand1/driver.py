@@ -152,7 +152,7 @@ class HandReader(threading.Thread):
 
 
 def _plausible(state: HandState) -> HandState:
-    """Return a state, or raise an error if its numbers cannot be those of a hand."""
+    """Return a state, or raise an error if its numbers are impossible for a hand."""
     if state.joint_id.tolist() != list(range(len(JOINTS))):
         raise ProtocolError(f"the joints of a reply are numbered {state.joint_id.tolist()}, expected 0 to 11")
     if not np.isfinite(state.position).all():
@@ -244,7 +244,7 @@ class XHand1(Closable):
         """Set the joint angles to go to [rad]; to be called again within the watchdog's time, also to stay there.
 
         Raises:
-            MotionError: If the hand was opened for reading alone, was made passive, or a target is outside its range.
+            MotionError: If the hand was opened for reading alone, was stopped, or a target is outside its range.
             WatchdogError: If the last command is too long ago.
             HandClosedError: If the hand was closed.
         """
@@ -263,13 +263,13 @@ class XHand1(Closable):
             self._reader.motion.relax()
 
     def resume(self) -> None:
-        """Allow commands again after the hand was made passive; it stays passive until the next one."""
+        """Allow commands again after the hand was stopped; it stays passive until the next command."""
         with self._reader.changed:
             self._reader.motion.resume()
 
     @property
     def stopped(self) -> HandError | None:
-        """Why the hand was made passive; None if it was not."""
+        """Why the hand was stopped and is passive; None if it was not."""
         with self._reader.changed:
             return self._reader.motion.stopped
 

@@ -32,7 +32,7 @@ class MotionLimits:
     kp: int  # proportional gain [hand's unit]
     ki: int = 0  # integral gain [hand's unit]
     kd: int = 0  # derivative gain [hand's unit]
-    watchdog_s: float = 0.1  # the hand is made passive if no command comes for this long [s]
+    watchdog_s: float = 0.1  # the hand turns passive if no command comes for this long [s]
 
     def __post_init__(self) -> None:
         """Refuse limits that limit nothing."""
@@ -133,7 +133,7 @@ class Motion:
 
     def __init__(self, limits: MotionLimits | None):
         self.limits = limits
-        self.stopped: HandError | None = None  # why the hand was made passive; None if it was not
+        self.stopped: HandError | None = None  # why the hand was stopped and is passive; None if it was not
         self._target: JointArray | None = None
         self._setpoint = np.zeros(NUM_JOINTS)
         self._commanded_at = self._stepped_at = 0.0
@@ -152,7 +152,7 @@ class Motion:
         if target.shape != (NUM_JOINTS,):
             raise self.stop(MotionError(f"the target has shape {target.shape}, expected ({NUM_JOINTS},)"))
         if self.stopped is not None:
-            raise type(self.stopped)(f"the hand was made passive: {self.stopped}; call resume() to go on")
+            raise type(self.stopped)(f"the hand is passive: {self.stopped}; call resume() to go on")
         lower, upper = np.array(self.limits.lower), np.array(self.limits.upper)
         outside = ~((target >= lower - ROUNDING) & (target <= upper + ROUNDING))
         if outside.any():

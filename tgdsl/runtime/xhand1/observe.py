@@ -1,11 +1,11 @@
-"""A module's observations, made of what a hand says instead of readings: same groups, names, order, dtype and device.
+"""A module's observations, computed from a hand's state instead of readings: same groups, names, order, dtype and device.
 
 `agg_force` is the calibrated force on each fingertip [unit of the calibration]; the simulation's `scale` is the factor from
 summed depth to that unit. `agg_bool` is whether that force is larger than the calibration's `contact_threshold`, where the
-simulation counts taxels. A sensor's `rate` and `history` are those of the module; its noise is not added.
+simulation counts taxels. A sensor's `rate` and `history` follow the module; its noise is not added.
 
-`joint_pos` is what the hand says, `joint_vel` its difference in time (see `velocity`). `last_action` is what the policy last
-gave, whether or not the hand was allowed to follow; before that, the angles at which the joints were.
+`joint_pos` is the hand's reply, `joint_vel` its difference in time (see `velocity`). `last_action` is the policy's last
+action, whether or not the hand was allowed to follow; before the first, the measured joint angles.
 
 Shapes: `env` one, `finger`, `joint` and `taxel` as in `protocol`, `feature` numbers of an observation.
 """
@@ -40,7 +40,7 @@ TIP_BODIES = ("thumb_rota_link2", "index_rota_link2", "mid_link2", "ring_link2",
 _GIVES = (
     "it can give: none, agg_force and agg_bool of sensors whose links are fingertips, one per finger "
     f"(bodies {', '.join(f'*_hand_{name}' for name in TIP_BODIES)}), "
-    "joint_pos and joint_vel of its own joints, last_action, taxel_counts, taxel_saturated"
+    "joint_pos and joint_vel of the hand's joints, last_action, taxel_counts, taxel_saturated"
 )
 _KEPT = ("stack", "last")
 
@@ -81,12 +81,11 @@ def hand_terms(plan: Plan, contact_threshold: float | None, is_log: bool = False
 
 
 def warn_of_noise(plan: Plan) -> None:
-    """Warn that the noise of sensors that are observed is not added to what a real hand says."""
+    """Warn that the noise of observed sensors is not added to a real hand's values."""
     observed = [plan.sensor_of(term.reading) for term in plan.observations if term.reading not in (None, *PROPRIOCEPTION)]
     noisy = sorted({sensor.sensor for sensor in observed if sensor.noise is not None})
     if noisy:
-        problem = f"the noise of {', '.join(noisy)} is that of a simulated sensor"
-        warnings.warn(f"{problem}: it is not added to what a hand says", stacklevel=3)
+        warnings.warn(f"the noise of {', '.join(noisy)} is simulated: it is not added to a hand's values", stacklevel=3)
 
 
 def finger_of(body: str) -> int | None:
@@ -120,7 +119,7 @@ def _joint_term(plan: Plan, planned: PlannedObservation, is_log: bool) -> HandTe
     if planned.type == "joint_effort":
         raise ObservationError("it reports each drive's current as a raw number, and no torque")
     if planned.type == "last_action" and is_log:
-        raise ObservationError("a log does not hold what the hand was told")
+        raise ObservationError("a log does not hold the hand's commands")
     rows = plan.inputs.actuators if planned.type == "last_action" else plan.inputs.joints
     if planned.constants:
         rows = tuple(rows[i] for i in plan.arrays[f"observations/{planned.group}/{planned.index}/rows"])
@@ -184,7 +183,7 @@ class HandObserver:
         return {group: torch.cat(parts, dim=1) for group, parts in groups.items()}
 
     def reset(self) -> None:
-        """Forget the last samples, and what was last given."""
+        """Forget the last samples and the last action."""
         self._action = None
         for past in self._pasts:
             past.reset()

@@ -44,7 +44,7 @@ class VelocityFilter:
         self._position = self._velocity = np.zeros(0)
 
     def update(self, time_s: float, position: Float[np.ndarray, " joint"]) -> Float[np.ndarray, " joint"]:
-        """Take the angles [rad] at a time [s] and return the speeds [rad/s]; those of the first reading are 0.
+        """Take the angles [rad] at a time [s] and return the speeds [rad/s], 0 at the first reading.
 
         A time that is not later than the last changes nothing.
         """
@@ -153,7 +153,7 @@ class HandSource(Closable, ABC):
 
     @abstractmethod
     def _restart(self) -> None:
-        """Reset, but for the speeds."""
+        """Reset all except the speeds."""
 
     def resume(self) -> None:
         """Let a hand move again after an error made it passive."""

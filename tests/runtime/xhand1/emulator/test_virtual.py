@@ -233,7 +233,7 @@ def test_a_failure_on_the_line_leaves_the_hand_passive_although_no_reply_is_unde
         time.sleep(LIMIT_S)
         assert driving(port)[-1] < time.now - 0.03
         assert emulated.is_passive or faults.silence
-        with pytest.raises(error, match="the hand was made passive"):
+        with pytest.raises(error, match="the hand is passive"):
             hand.command(REST)
         port.set_faults(Faults())
         time.sleep(LIMIT_S)
@@ -248,7 +248,7 @@ def test_a_hand_that_was_unplugged_while_it_moved_is_passive_when_it_is_back(mon
         drive(hand, time)
         port.unplug()
         time.sleep(0.05)
-        with pytest.raises(HandDisconnectedError, match="the hand was made passive"):
+        with pytest.raises(HandDisconnectedError, match="the hand is passive"):
             hand.command(REST)
         assert not emulated.is_passive
         port.replug()

@@ -166,9 +166,9 @@ class EmulatedLine:
             self.send(encode_frame(reply), arrived_at + self._turnaround_s)
 
     def send(self, raw: bytes, ready_at: float) -> None:
-        """Put bytes on the line from a time on [s], behind those that are on their way.
+        """Queue bytes for the line, sent at `ready_at` [s] or after all queued bytes.
 
-        Where they follow others without a gap, the pieces in which they come out do not show the seam.
+        Bytes that follow others without a gap join their chunk, so that reads do not reveal the boundary.
         """
         start = max(ready_at, self._free_at)
         if self._chunks and start == self._free_at and len(self._chunks[-1][1]) < _CHUNK:

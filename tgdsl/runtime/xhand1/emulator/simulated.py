@@ -46,16 +46,16 @@ class SimulatedTips:
     """Forces on the fingertips: the aggregate forces that a module observes in its own scene."""
 
     def __init__(self, touch: TactileModule, terms: Sequence[HandTerm]):
-        """Find the observation of each fingertip's force; an error names those that the emulator cannot give."""
+        """Find the observation of each fingertip's force; an error names observations that the emulator cannot give."""
         self._touch = touch
         self._places: dict[int, tuple[HandTerm, int]] = {}  # by finger: an observation of its force, and which of its links
         for term in terms:
             if term.planned.type in HAND_ONLY:
                 raise ObservationError(f"{term.label}: the emulator cannot give it: where the hand's taxels are is not known")
             for link, finger in enumerate(term.fingers if term.planned.type == "agg_force" else ()):
-                known, at = self._places.setdefault(finger, (term, link))
-                if self._operator(known, at) != self._operator(term, link):
-                    problem = f"{known.label} and {term.label} differ, but the hand has one force on its {FINGERS[finger]}"
+                first, at = self._places.setdefault(finger, (term, link))
+                if self._operator(first, at) != self._operator(term, link):
+                    problem = f"{first.label} and {term.label} differ, but the hand has one force on its {FINGERS[finger]}"
                     raise ObservationError(f"{problem}; give them the same `scale` and sensor")
         for term in terms:
             missing = [FINGERS[finger] for finger in term.fingers if finger not in self._places]
@@ -137,7 +137,7 @@ class SimulatedBody(Body):
             self._feel()
 
     def run(self) -> None:
-        """Step in real time from now on, in a thread of its own, until `close`."""
+        """Step in real time in a new thread, until `close`."""
         self._thread = threading.Thread(target=self._run, name="xhand1-physics", daemon=True)
         self._thread.start()
 

@@ -9,8 +9,8 @@ Arrays of the file, readable with `numpy.load`:
   and how many readings had come before;
 - `about`: text (JSON) with the format's version, the hand's identity, its calibration's text and the time of day at the start.
 
-An hour at the highest rate that the wire allows, 119 readings a second, is 430,000 records of 4 kB: too much to keep. They are
-appended to a spool beside the file, and put into the file when all is over; some MB are in memory at a time.
+An hour at the wire's highest rate, 119 readings a second, is 430,000 records of 4 kB: too much for memory. Records go to a
+spool file in the same folder and are copied into the log at the end; a few MB are in memory at a time.
 
 Shapes: `reading` the readings, `fault` the failures; others as in `protocol`.
 """
@@ -148,7 +148,7 @@ def open_log(path: str | Path) -> HandLog:
             if "about.npy" not in archive.namelist():
                 raise LogError(f"{path}: no log of `tgdsl hand record`: this .npz file has no array `about`")
             if (damaged := archive.testzip()) is not None:
-                raise LogError(f"{path}: this log is damaged: its array {damaged.removesuffix('.npy')} is not what was written")
+                raise LogError(f"{path}: this log is damaged: its array {damaged.removesuffix('.npy')} has a wrong checksum")
             about = json.loads(str(_array(archive, "about")))
             if about["format"] != FORMAT:
                 raise LogError(f"{path}: a log of format {about['format']}, this version of tgdsl reads format {FORMAT}")
@@ -194,7 +194,7 @@ def events(hand: XHand1, seconds: float) -> Iterator[Reading | Fault]:
 class LogWriter:
     """Writes a log. Use it as a context manager, or call `close`; the file appears whole, at the end, or not at all.
 
-    What was added is written also if the block that adds it fails.
+    If the block fails, the records added so far are written.
     """
 
     def __init__(self, path: str | Path, *, identity: HandIdentity | None = None, calibration: Calibration | None = None):

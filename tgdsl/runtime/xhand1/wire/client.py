@@ -1,15 +1,15 @@
-"""One request and its reply on the serial line, with all that can come between; and the port, by pyserial, an extra.
+"""One request and its reply on a serial line, with noise and stale replies; and the port, by pyserial, an extra.
 
-Replies carry no number that says which request they answer. So that an old one is never taken for a new one:
+Replies carry no sequence number. These rules keep an old reply from being taken for a new one:
 
 - a request goes out only on a silent line, and the last reply before the line falls silent again counts, if no damaged one
   follows;
 - a reply that is complete before the wire could have carried it is not this request's;
-- after a failure the hand is asked for its version: the answer can only follow what was still on its way.
+- after a failure the client requests the version: that answer comes after all late replies.
 
-A hand that does not answer version requests (their reply is *unverified*) must be silent for `settle_s` instead. What is then
-left: a reply that comes later than `reply_timeout_s + settle_s`, and apart from the next one, is taken for the next one. And
-for all hands: one that is repeated after a silence, just when the next one would come, if that is lost.
+A hand that does not answer version requests (their reply is *unverified*) must be silent for `settle_s` instead. One error
+remains: a reply later than `reply_timeout_s + settle_s`, and apart from the next one, counts as the next one. For all hands,
+so does a reply repeated after a silence if the next one is lost.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Port(Protocol):
     def write(self, data: bytes) -> None: ...
 
     def read(self) -> bytes:
-        """Return what has arrived; if nothing has, wait `POLL_S` for it and return what came, or no bytes."""
+        """Return the bytes that have arrived; if there are none, wait up to `POLL_S` for some."""
         ...
 
     def pending(self) -> int:
@@ -124,15 +124,15 @@ class SerialTiming:
     baud: int = BAUD  # bits per second; 10 bits carry one byte
     reply_timeout_s: float = 0.03  # how long a reply may take to be complete [s]
     silence_s: float = 0.018  # silence after which a reply that has begun will not go on [s]; FTDI pauses for up to 16 ms
-    settle_s: float = 0.018  # silence that is asked for after a failure [s]: if the hand tells its version, since the last byte
+    settle_s: float = 0.018  # required silence after a failure [s]: since the last byte, if the hand reports its version
     quiet_s: float = 0.0005  # silence that ends a good reply [s]
-    # whether a reply that is complete sooner than the baud rate allows is refused as that of an earlier request. Turn it off
-    # for a line that is faster than it says.
+    # whether a reply complete sooner than the baud rate allows is refused as an earlier request's. Turn it off for a line
+    # that is faster than its baud rate.
     checks_wire_time: bool = True
 
     @property
     def exchange_s(self) -> float:
-        """How long the bytes of a command and of the state that answers it take on the line [s]."""
+        """Transfer time of a command and its reply, a state, on the line [s]."""
         return 10 * (2 * OVERHEAD + COMMAND_SIZE + STATE_SIZE) / self.baud
 
 
@@ -344,8 +344,8 @@ class SerialClient:
     def _failure(self, waiting: _Waiting) -> HandError:
         request = f"command {waiting.command:#04x} ({waiting.command.name.lower()})"
         if waiting.refusal is not None:
-            what = waiting.refusal.hex(" ") or "nothing"
-            return HandRefusedError(f"the hand refused {request}; its error reply holds {what}")
+            content = waiting.refusal.hex(" ") or "nothing"
+            return HandRefusedError(f"the hand refused {request}; its error reply holds {content}")
         if waiting.is_babble:
             return HandTimeoutError(_BABBLE)
         if waiting.num_damaged > waiting.num_incomplete:

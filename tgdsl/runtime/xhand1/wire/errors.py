@@ -30,4 +30,4 @@ class MotionError(HandError):
 
 
 class WatchdogError(MotionError):
-    """No command came in time, so the hand was made passive."""
+    """No command came in time, so the hand turned passive."""

@@ -15,7 +15,7 @@ from tgdsl.runtime.xhand1.wire.protocol import Command, Register, encode_registe
 
 _OpenPort = Callable[[str, int], Port]  # opens a port, given its name and baud rate
 _PATIENT = SerialTiming(reply_timeout_s=0.1)
-"""A reply that comes later is taken for that of the next id which is asked, so a busy computer is given time."""
+"""A late reply would count for the next id, so a busy computer gets more time."""
 _MORE_PATIENT = SerialTiming(reply_timeout_s=0.4)
 
 
@@ -30,7 +30,7 @@ class FoundHand(NamedTuple):
 def find_hands(
     device: str, hand_ids: Iterable[int] = range(8), *, timing: SerialTiming | None = None, open_port: _OpenPort = SerialPort
 ) -> tuple[FoundHand, ...]:
-    """Ask each id on a port for its version and return those that answer."""
+    """Request the version of each id on a port and return the hands that answer."""
     timing = timing or SerialTiming()
     client = SerialClient(open_port(device, timing.baud), None, timing)
     results = []
@@ -118,12 +118,12 @@ class HandIdentity:
     def __str__(self) -> str:
         values = {"version": self.version, "side": self.side, "serial number": self.serial_number, "name": self.name}
         return f"{self.device}: hand {self.hand_id}, " + ", ".join(
-            f"{label} {_shown(value)}" for label, value in values.items()
+            f"{label} {_as_text(value)}" for label, value in values.items()
         )
 
 
 def identify(hand: FoundHand, *, timing: SerialTiming | None = None, open_port: _OpenPort = SerialPort) -> HandIdentity:
-    """Ask a hand that was found for its registers."""
+    """Read the registers of a hand from `find_hands`."""
     timing = timing or SerialTiming()
     client = SerialClient(open_port(hand.device, timing.baud), hand.addresses, timing)
 
@@ -140,8 +140,8 @@ def identify(hand: FoundHand, *, timing: SerialTiming | None = None, open_port: 
     return HandIdentity(hand.device, hand.addresses.hand_id, hand.version, *registers)
 
 
-def _shown(value: bytes | None) -> str:
-    """Return what a reply held as text if it is text, padded with zeros or not; else as hexadecimal bytes."""
+def _as_text(value: bytes | None) -> str:
+    """Return a reply's payload as quoted text if it is printable, without zero padding; else as hexadecimal bytes."""
     if value is None:
         return "not told"
     text = value.rstrip(b"\0")

@@ -91,14 +91,14 @@ _SLICE = 4096
 class FrameParser:
     """Takes bytes as they come and gives the frames whose checksum is right.
 
-    The frames depend on the bytes alone, not on how they were cut. A header that leads to no frame costs one byte: the
-    search goes on right behind it, so that it finds a frame inside what looked like another. At most one frame of the
-    largest size and one slice of 4 KiB are kept.
+    The frames depend on the bytes alone, not on how they were split. A header without a valid frame costs one byte: the
+    search continues right behind it, and so finds a frame inside an apparent one. The buffer holds at most one frame of the
+    largest size and one slice of 4 KiB.
     """
 
     def __init__(self) -> None:
         self.num_discarded = 0  # bytes so far that belonged to no frame
-        self.num_trailing = 0  # those of them that came after the last frame
+        self.num_trailing = 0  # number of them after the last frame
         self._buffer = bytearray()
 
     @property
@@ -286,8 +286,8 @@ def encode_state(state: HandState) -> bytes:
             record[part][name] = value
             continue
         if ((value < FORCE_MIN) | (value > FORCE_MAX)).any():
-            what = name.replace("_", " ")
-            raise ProtocolError(f"{what}s from {value.min()} to {value.max()}: expected x, y in -128…127, z in 0…255")
+            label = name.replace("_", " ")
+            raise ProtocolError(f"{label}s from {value.min()} to {value.max()}: expected x, y in -128…127, z in 0…255")
         for i, axis in enumerate("xyz"):
             record[part][name][axis] = value[..., i]
     return record.tobytes()
