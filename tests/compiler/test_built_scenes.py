@@ -155,7 +155,7 @@ def test_what_a_given_scene_cannot_do_is_said(tmp_path):
     plain = plain.replace("<freejoint/><geom", '<freejoint/><geom name="two"')
     for text, message in (
         (SCENE, "of type hfield, which USD does not have; pass the MjSpec that this MjModel was compiled from"),
-        (plain.replace("</worldbody>", PAIR), "of this MjModel alone, npair would be kept otherwise"),
+        (plain.replace("</worldbody>", PAIR), "from this MjModel alone, npair would change"),
     ):
         with pytest.raises(RobotError, match=re.escape(message)):
             tgdsl.compile(DOCUMENT, scene=mujoco.MjModel.from_xml_path(write(tmp_path, text)))

@@ -220,7 +220,7 @@ def test_xacro_is_told_from_urdf(tmp_path, declared):
     """Its links stand in files that it includes, so that without them there would be an empty world."""
     path = tmp_path / "hand.urdf.xacro"
     path.write_text(f"<robot name='hand'{declared}><xacro:include filename='fingers.xacro'/></robot>")
-    with pytest.raises(RobotError, match=r"this is xacro, of which URDF is made: xacro hand\.urdf\.xacro > hand\.urdf"):
+    with pytest.raises(RobotError, match=r"this is xacro, make URDF from it: xacro hand\.urdf\.xacro > hand\.urdf"):
         load_model(path)
 
 

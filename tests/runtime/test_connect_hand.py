@@ -130,7 +130,7 @@ def test_a_hand_goes_where_the_actuators_say(tmp_path):
         assert emulator.hand.is_passive
         with pytest.raises(MotionError, match=r"pinky_joint2: target 1.5 rad, expected -1 to 1"):
             env.step(np.array([1.5] + [0.1] * 11))
-        with pytest.raises(MotionError, match=r"made passive: .* call resume\(\) to go on"):
+        with pytest.raises(MotionError, match=r"is passive: .* call resume\(\) to go on"):
             env.step(SQUEEZE)
         assert isinstance(env.source, XHand1Source)
         hand = env.source.hand

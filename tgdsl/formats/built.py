@@ -30,8 +30,8 @@ _KEPT = (
 def built_scene(scene: Any) -> Model:
     """Return a scene as a model.
 
-    Geometry is that of the given scene to the last bit. The MJCF beside it, for simulations of the artefact, has six digits if
-    it is of an `MjSpec`; textures are left behind.
+    Geometry is bit-identical to the scene's. Its MJCF text, for simulations of the artefact, has six digits if it comes from an
+    `MjSpec`; textures are left behind.
 
     Raises:
         RobotError: If MuJoCo cannot compile the scene, or an `MjModel` has something that only its `MjSpec` tells.
@@ -113,7 +113,7 @@ def _of_model(compiled: mujoco.MjModel) -> Model:
     if len(is_plane) == compiled.ngeom:  # a plane collides without end: its size says how much of it is drawn
         model.compiled.geom_size[is_plane] = compiled.geom_size[is_plane]
     if lost := [name for name in differing_fields(compiled, model.compiled, is_rounded=True) if name in _KEPT]:
-        problem = f"{FILE}: of this MjModel alone, {listed(lost)} would be kept otherwise"
+        problem = f"{FILE}: from this MjModel alone, {listed(lost)} would change"
         raise RobotError(f"{problem}; pass the MjSpec that this MjModel was compiled from")
     return replace(model, file=FILE, compiled=compiled)
 

@@ -21,7 +21,7 @@ class Actuator:
 
     name: str  # its name; empty if it has none
     id: int  # MuJoCo's index
-    joints: tuple[str, ...]  # names of the hinges and slides that it acts on: one, or those of its fixed tendon
+    joints: tuple[str, ...]  # names of the hinges and slides that it acts on: one, or its fixed tendon's
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class RobotJoints:
 
     joints: tuple[str, ...]  # hinges and slides: first the actuated ones, in the order of the actuators
     num_actuated: int  # how many of them have an actuator
-    slides: frozenset[str]  # those that are slides
+    slides: frozenset[str]  # names of the slides among `joints`
     others: tuple[str, ...]  # names of its ball and free joints
     actuators: tuple[Actuator, ...]  # its actuators, in the model's order
 

@@ -1,10 +1,9 @@
 """Mesh files that MuJoCo does not read itself, read by trimesh: glTF, COLLADA, PLY and OFF.
 
-A file's scene becomes one mesh, each node's under its transform; materials and textures are left out. Numbers are kept as the
-file has them, in its frame: glTF's are metres with Y up by its specification, and are not turned to have Z up. So do yourdfpy
-and trimesh, three.js' urdf-loader and SAPIEN, for which the glTF files of hands are mostly made (those of dex-urdf lie in the
-frames of their links); RViz 2 since 2025 and Drake do turn them. COLLADA's `up_axis` is left alone too, as RViz does,
-and its unit, which most URDF loaders apply, is applied.
+A file's scene becomes one mesh, with each node's transform applied; materials and textures are left out. Coordinates stay in
+the file's frame: glTF's are metres with Y up by its specification, and are not rotated to Z up. yourdfpy, trimesh, three.js'
+urdf-loader and SAPIEN do the same, and most glTF files of hands target them (dex-urdf's are in link frames); RViz 2 since
+2025 and Drake rotate them. COLLADA's `up_axis` is ignored too, as by RViz; its unit is applied, as by most URDF loaders.
 """
 
 from __future__ import annotations
@@ -21,10 +20,10 @@ from jaxtyping import Float, Int
 from tgdsl.errors import RobotError, listed
 
 BY_MUJOCO = (".stl", ".obj", ".msh")  # endings of the mesh files that MuJoCo reads
-BY_TRIMESH = (".glb", ".gltf", ".dae", ".ply", ".off")  # endings of those that are read here
-Y_UP = (".glb", ".gltf", ".dae")  # endings of those whose up axis is, or may be, Y
+BY_TRIMESH = (".glb", ".gltf", ".dae", ".ply", ".off")  # endings of the mesh files read here
+Y_UP = (".glb", ".gltf", ".dae")  # endings of formats whose up axis is, or may be, Y
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_")
-"""How the names of glTF's extensions begin that change nothing in triangles."""
+"""Prefixes of glTF extensions that do not change triangles."""
 DIGITS = 6  # significant digits of coordinates: what MuJoCo writes in MJCF
 
 
@@ -56,7 +55,7 @@ def triangles(file: Path) -> tuple[Float[np.ndarray, "vertex 3"], Int[np.ndarray
 
 
 def put_in_line(mesh: mujoco.MjsMesh, file: Path) -> None:
-    """Give a mesh of a MuJoCo model the triangles of a file instead of the file's name; what is flat weighs as a shell."""
+    """Give a mesh of a MuJoCo model the triangles of a file instead of the file's name; a flat mesh weighs as a shell."""
     vertices, faces = triangles(file)
     mesh.file = ""
     mesh.uservert, mesh.userface = vertices.ravel(), faces.ravel()
@@ -83,8 +82,8 @@ def _check_extensions(file: Path) -> None:
     if content[:4] == b"glTF":
         content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
     try:
-        wanted = json.loads(content).get("extensionsRequired", [])
+        extensions = json.loads(content).get("extensionsRequired", [])
     except (ValueError, AttributeError) as error:
         raise RobotError(f"{file}: not glTF 2.0: {error}") from error
-    if unknown := [name for name in wanted if not name.startswith(_HARMLESS)]:
+    if unknown := [name for name in extensions if not name.startswith(_HARMLESS)]:
         raise RobotError(f"{file}: this mesh is stored by {listed(unknown)}, which cannot be read; export it without")

@@ -29,7 +29,7 @@ def read_mjcf(path: Path) -> Model:
     refuse_unreadable(path, spec)
     rewritten = rewrite_meshes(spec)
     try:
-        compiled = spec.copy().compile()  # of which the spec remembers nothing, such as hulls that other geoms do not need
+        compiled = spec.copy().compile()  # a copy: compiling stores results in the spec, such as hulls that geoms may not need
     except ValueError as error:
         files = [Path(spec.modelfiledir, spec.meshdir, mesh.file) for mesh in spec.meshes if mesh.file]
         raise ValueError(f"{error}{in_other_case(file for file in files if not file.is_file())}") from error
@@ -37,7 +37,7 @@ def read_mjcf(path: Path) -> Model:
 
 
 def rewrite_meshes(spec: mujoco.MjSpec) -> dict[str, Path]:
-    """Rewrite in memory those of a model's own mesh files that MuJoCo cannot read; return the files by their new names."""
+    """Rewrite in memory a model's mesh files that MuJoCo cannot read; return the files by their new names."""
     files, whole = {}, []
     for mesh in spec.meshes:
         file = Path(spec.modelfiledir, spec.meshdir, mesh.file)
@@ -85,9 +85,9 @@ def xml_files(path: Path) -> Iterator[Path]:
 
 
 def write_mjcf(text: str, out: Path) -> None:
-    """Write MJCF with its inline meshes as `.obj` files in the folder `<stem>_assets` beside it.
+    """Write MJCF, with its inline meshes as `.obj` files in the folder `<stem>_assets` next to it.
 
-    Nothing half-written is left behind.
+    On an error no partial output is left.
 
     Raises:
         FileError: If it cannot be written.

@@ -18,7 +18,7 @@ from tgdsl.scene.mujoco_warnings import muted_mujoco
 from tgdsl.surfaces.geom import Geom
 from tgdsl.surfaces.surface import Surface
 
-LEAST_INERTIA = 1e-9  # least principal moment of a body whose inertia, as its file has it, is that of no real body [kg·m²]
+LEAST_INERTIA = 1e-9  # least principal moment of a body whose inertia in the file is not physical [kg·m²]
 SHAPE_NAMES = {int(kind): name.removeprefix("mjGEOM_").lower() for name, kind in mujoco.mjtGeom.__members__.items()}
 
 
@@ -49,7 +49,7 @@ class Model:
         return tuple(name for name in names if name)
 
     def body_path(self, i: int) -> str:
-        """Return what to call a body: its name, or how one without is found: `forearm/[2]`, the forearm's second child."""
+        """Return a body's name; for an unnamed body its path: `forearm/[2]` is the forearm's second child."""
         if name := self.compiled.body(i).name:
             return name
         parent = int(self.compiled.body_parentid[i])

@@ -81,7 +81,7 @@ def export_model(model_file: Path, out: Path) -> None:
 def _root_element(path: Path) -> str:
     """Return the name of an XML file's root element, or nothing if it is not XML."""
     try:
-        with path.open("rb") as file:  # what is left half read must not stay open
+        with path.open("rb") as file:  # `iterparse` of a path would leave the file open
             for _, element in ET.iterparse(file, events=("start",)):
                 return element.tag
     except (ET.ParseError, OSError):

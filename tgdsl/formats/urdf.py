@@ -32,7 +32,7 @@ def read_urdf(path: Path) -> Model:
     """Read and compile a URDF file.
 
     Raises:
-        RobotError: If the file is not XML, or a mesh cannot be found.
+        RobotError: If the file is not XML, or a mesh file is missing.
         ValueError: If MuJoCo cannot read or compile it.
     """
     text, files = as_mujoco_text(path)
@@ -76,7 +76,7 @@ def _overlaps_with_base(model: mujoco.MjModel) -> list[tuple[str, str]]:
 
 
 def _fill_meshes(path: Path, spec: mujoco.MjSpec, files: Mapping[str, Path]) -> None:
-    """Have each mesh name its file, or hold its triangles where MuJoCo does not read such files, of which a warning tells."""
+    """Set each mesh's file, or its triangles, with a warning, where MuJoCo cannot read the format."""
     read_here = dict[Path, None]()
     for mesh in spec.meshes:
         file = files[Path(mesh.file).stem]
@@ -92,13 +92,13 @@ def _fill_meshes(path: Path, spec: mujoco.MjSpec, files: Mapping[str, Path]) -> 
 
 
 def as_mujoco_text(path: Path) -> tuple[str, dict[str, Path]]:
-    """Return a URDF's text with what MuJoCo needs to read it, and the file of each mesh by the stem of its name in there.
+    """Return a URDF's text, adapted for MuJoCo, and the file of each mesh by the stem of its name in the text.
 
-    `package://` and `model://` are looked up in the folders above the file: by the name in a `package.xml`, or by their own.
-    A moving link without mass or geometry gets `LEAST_MASS`; an inertia that no rigid body can have becomes that of a ball.
+    `package://` and `model://` are looked up in the folders above the file: by the name in a `package.xml`, or the folder's.
+    A moving link without mass or geometry gets `LEAST_MASS`; an unphysical inertia becomes a ball's.
 
     Raises:
-        RobotError: If the file is not XML, or a mesh cannot be found.
+        RobotError: If the file is not XML, or a mesh file is missing.
     """
     robot = _root(path)
     _number_names(robot)
@@ -126,7 +126,7 @@ def as_mujoco_text(path: Path) -> tuple[str, dict[str, Path]]:
 
 
 def _root(path: Path) -> ET.Element:
-    """Return a URDF's root; tags of other programs, by prefixes that may not be declared, are taken out."""
+    """Return a URDF's root without tags of other programs, whose prefixes may be undeclared."""
     content = path.read_bytes()
     try:
         root = ET.fromstring(content)
@@ -141,9 +141,7 @@ def _root(path: Path) -> ET.Element:
         except ET.ParseError:
             raise RobotError(f"{path}: not XML: {error}") from error
     if any(isinstance(part.tag, str) and part.tag.partition("}")[0].endswith("xacro") for part in root.iter()):
-        raise RobotError(
-            f"{path}: this is xacro, of which URDF is made: xacro {path.name} > {path.name.partition('.')[0]}.urdf"
-        )
+        raise RobotError(f"{path}: this is xacro, make URDF from it: xacro {path.name} > {path.name.partition('.')[0]}.urdf")
     for parent in list(root.iter()):
         for child in [child for child in parent if isinstance(child.tag, str) and child.tag.startswith("{")]:
             parent.remove(child)
@@ -170,8 +168,8 @@ def _mesh_file(name: str, urdf: Path) -> Path:
     folders = urdf.resolve().parents
     if scheme in ("package", "model"):
         package, _, rest = inside.partition("/")
-        own = [folder / rest for folder in folders if package in (folder.name, _package_name(folder))]
-        files, problem = [*own, *(folder / inside for folder in folders)], f'no folder above the file holds "{inside}"'
+        packages = [folder / rest for folder in folders if package in (folder.name, _package_name(folder))]
+        files, problem = [*packages, *(folder / inside for folder in folders)], f'no folder above the file holds "{inside}"'
     else:
         files = [folders[0] / name.removeprefix("file://")]
         problem = f"there is no file {files[0]}"

@@ -164,7 +164,7 @@ def test_a_tendon_on_no_side_of_a_ball_is_named(tmp_path):
     relate(stage.GetPrimAtPath("/cable"), "mjc:sideSites", ["/link/seen"])
     author(stage.GetPrimAtPath("/cable"), "mjc:sideSites:indices", (-1, 0, -1))
     model, messages = warned(stage)
-    assert messages == ["tendons were dropped that pass over what is no joint, site or geom of the model: /cable"]
+    assert messages == ["tendons were dropped whose path names no joint, site or geom of the model: /cable"]
     assert [model.tendon(i).name for i in range(model.ntendon)] == ["tendon"]
 
 
@@ -174,7 +174,7 @@ def test_a_tendon_over_nothing_is_named_and_so_is_its_actuator(tmp_path):
     actuate(stage, target=["/tendon"])
     model, messages = warned(stage)
     assert messages == [
-        "tendons were dropped that pass over what is no joint, site or geom of the model: /tendon",
+        "tendons were dropped whose path names no joint, site or geom of the model: /tendon",
         "actuators were dropped whose target is no joint, site, tendon or body of the model: /motor",
     ]
     assert model.ntendon == 1

@@ -69,7 +69,7 @@ def test_a_leader_that_is_no_joint_of_the_tree_is_named(tmp_path):
     apply(stage.GetPrimAtPath("/follow"), "NewtonMimicAPI")
     relate(stage.GetPrimAtPath("/follow"), "newton:mimicJoint", ["/fixed"])
     model, messages = warned(stage)
-    assert messages == ["couplings were dropped of which the leader or the follower is no revolute or prismatic joint: /follow"]
+    assert messages == ["couplings were dropped whose leader or follower is no revolute or prismatic joint: /follow"]
     assert model.neq == 0
 
 

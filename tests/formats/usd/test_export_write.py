@@ -161,7 +161,7 @@ HINGES = "<body name='knot'><joint axis='1 0 0'/><joint axis='0 1 0'/><geom size
         (
             world_of(HINGES),
             "r.usda",
-            '{file}: body "knot" has 2 joints, and a body in USD has one to its parent; give each joint a body of its own',
+            '{file}: body "knot" has 2 joints, and a body in USD has one to its parent; give each joint a separate body',
         ),
         (
             world_of(

@@ -288,7 +288,7 @@ def test_names(tmp_path):
     add_body(stage, "/hand/index/tip/nested", (1, 0, 0))  # a body in a body moves on its own
     add_shape(stage, "/hand/index/tip/nested/nail")
     model, messages = warned(stage)
-    assert messages == ["names in tgdsl:name were dropped that are taken: /hand/back"]
+    assert messages == ["duplicate names in tgdsl:name were dropped: /hand/back"]
     names = {model.body(i).name for i in range(model.nbody)}
     assert names == {"world", "thumb_tip", "index_tip", "hand_world", "right/palm", "back", "nested"}
     geoms = {model.geom(i).name: model.body(model.geom_bodyid[i]).name for i in range(model.ngeom)}

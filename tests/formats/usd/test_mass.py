@@ -97,8 +97,8 @@ def test_inertias_that_are_none_and_masses_without_inertia(tmp_path):
     model, messages = warned(stage)
     assert messages == [
         "inertias that no body can have were mended: /long",
-        "bodies have a mass but neither inertia nor colliders; their visuals were taken as solid: /seen",
-        "bodies have a mass but neither inertia nor geometry; a ball of 0.1 m radius was taken: /bare",
+        "bodies have a mass but neither inertia nor colliders; their visuals count as solid: /seen",
+        "bodies have a mass but neither inertia nor geometry; they count as a ball of 0.1 m radius: /bare",
     ]
     close(model.body("long").inertia, 0.04)
     close(model.body("disc").inertia, [0.1, 0.7, 0.8])

@@ -99,9 +99,7 @@ def test_the_watchdog_stops_and_only_resume_starts_again():
     motion.command(REST, 1.0, REST)
     assert motion.joints(1.0999) is not PASSIVE
     assert motion.joints(1.1001) is PASSIVE
-    with pytest.raises(
-        WatchdogError, match=r"made passive: no command came for 100 ms, expected one every 100 ms; call resume"
-    ):
+    with pytest.raises(WatchdogError, match=r"is passive: no command came for 100 ms, expected one every 100 ms; call resume"):
         motion.command(REST, 1.2, REST)
     assert motion.joints(1.2) is PASSIVE
     motion.resume()

@@ -1,6 +1,6 @@
 """Actuators that are prims, tendons and keyframes, read and written: MjcActuator, MjcTendon, MjcKeyframe, NewtonActuator.
 
-Names and types of attributes are those of MjcPhysics (mujoco-usd-converter 0.8); what it does not have is `tgdsl:`.
+Names and types of attributes follow MjcPhysics (mujoco-usd-converter 0.8); attributes that it lacks begin with `tgdsl:`.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ class Actuator:
 
     attributes: dict[str, str]  # of the element
     joint: str  # path of the joint that it acts on, or empty
-    order: float  # place among those that say so; the others come after them
+    order: float  # place among the actuators with an order; the others follow
     control: float = 0.0  # at the keyframe `authored`
     kind: str = "general"  # which element it is
 
 
 def read_actuators(stage: Stage, names: Names) -> list[Actuator]:
-    """Read all actuators that are prims, those of MuJoCo first, in stage order."""
+    """Read all actuator prims, MuJoCo's first, in stage order."""
     prims = [prim for prim in stage.prims if prim.GetTypeName() in (MJC_ACTUATOR, NEWTON_ACTUATOR)]
     prim_names = unique_names(stage, prims)
     results: list[Actuator] = []
@@ -99,7 +99,7 @@ def _newton_actuator(stage: Stage, prim: Prim, names: Names, name: str) -> Actua
 
 
 def servos_of(stage: Stage, joints: Iterable[Joint], prims: Sequence[Actuator], names: Names) -> list[Actuator]:
-    """Return the drives of joints as actuators, but those that a prim says more exactly."""
+    """Return the drives of joints as actuators, except where an actuator prim defines one."""
     results, of_joint = list[Actuator](), {actuator.joint: actuator for actuator in prims if actuator.joint}
     taken = {actuator.attributes["name"] for actuator in prims}
     for joint in joints:
@@ -115,8 +115,8 @@ def _is_same_servo(drive: Drive, actuator: Actuator) -> bool:
     gain, gear = (float(actuator.attributes.get(name, "1").split()[0]) for name in ("gainprm", "gear"))
     bias = [float(value) for value in actuator.attributes.get("biasprm", "").split()] + [0.0] * 3
     gains = np.array([gain, -bias[1], -bias[2]]) * gear**2
-    wanted = np.array([drive.stiffness or drive.damping, drive.stiffness, drive.damping])
-    return bool(np.allclose(gains, wanted, rtol=SAME_GAIN))
+    drive_gains = np.array([drive.stiffness or drive.damping, drive.stiffness, drive.damping])
+    return bool(np.allclose(gains, drive_gains, rtol=SAME_GAIN))
 
 
 def _servo(joint: Joint, drive: Drive, name: str, taken: set[str]) -> Actuator:
@@ -152,9 +152,9 @@ def write_actuators(writer: attr.StageWriter, actuators: list[int]) -> None:
         name, kind = model.actuator(actuator).name, int(model.actuator_trntype[actuator])
         ends = _ends(writer, actuator, kind)
         if ends is None or model.actuator_plugin[actuator] >= 0:
-            shown = f'actuator "{name}"' if name else f"unnamed actuator {actuator}"
+            label = f'actuator "{name}"' if name else f"unnamed actuator {actuator}"
             reason = "a plugin" if ends else "on what USD has no prim for (a free joint)"
-            writer.unsupported.append(f"{writer.file}: {shown} is {reason}: left out")
+            writer.unsupported.append(f"{writer.file}: {label} is {reason}: left out")
             continue
         prim = writer.define("MjcActuator", name or "actuator", name)
         attr.set_custom(prim, "order", actuator)
@@ -193,7 +193,7 @@ def read_tendons(stage: Stage, tendon: ET.Element, names: Names) -> None:
     for prim in prims:
         element = _tendon(stage, prim, names)
         if element is None:
-            stage.drop("tendons were dropped that pass over what is no joint, site or geom of the model", prim)
+            stage.drop("tendons were dropped whose path names no joint, site or geom of the model", prim)
             continue
         names.tendons[str(prim.GetPath())] = prim_names[str(prim.GetPath())]
         element.set("name", prim_names[str(prim.GetPath())])
@@ -235,11 +235,11 @@ def _spatial(stage: Stage, prim: Prim, names: Names, element: ET.Element, path: 
             raise stage.error(prim, f"mjc:{name} has {len(values)} numbers; the path has {len(path)} points")
     if max(segments) >= max(len(divisors), 1) or max(beside) >= len(sides):
         raise stage.error(prim, "mjc:path:divisors or mjc:sideSites has fewer entries than the path names")
-    divisors, before = divisors or [1.0], None
+    divisors, previous = divisors or [1.0], None
     for target, segment, side in zip(path, segments, beside, strict=True):
-        if segment != before and (before is not None or divisors[segment] != 1.0):
+        if segment != previous and (previous is not None or divisors[segment] != 1.0):
             ET.SubElement(element, "pulley", divisor=repr(float(divisors[segment])))
-        before = segment
+        previous = segment
         if target in names.sites:
             ET.SubElement(element, "site", site=names.sites[target])
             continue
@@ -299,7 +299,7 @@ def _write_path(writer: attr.StageWriter, tendon: int, prim: Any) -> None:
 
 
 def read_keyframes(stage: Stage, root: ET.Element, keyframe: ET.Element) -> None:
-    """Add all keyframes whose vectors fit the model; MuJoCo's order of joints and actuators is taken to be theirs."""
+    """Add all keyframes whose vectors fit the model; they are assumed to use MuJoCo's order of joints and actuators."""
     prims = [prim for prim in stage.prims if prim.GetTypeName() == "MjcKeyframe"]
     if not prims:
         return
@@ -308,7 +308,7 @@ def read_keyframes(stage: Stage, root: ET.Element, keyframe: ET.Element) -> None
     sizes |= {"mpos": 3 * model.nmocap, "mquat": 4 * model.nmocap, "time": 1}
     names = unique_names(stage, prims)
     for key in [key for key in keyframe if key.get("name") in names.values()]:
-        keyframe.remove(key)  # the stage's own overrules what was made of its poses
+        keyframe.remove(key)  # the stage's keyframe overrules the one derived from its poses
     for prim in prims:
         attributes = {name: value for name, value in attr.read_attributes(stage, prim, attr.KEY).items() if value}
         wrong = [name for name, value in attributes.items() if len(value.split()) != sizes[name]]

@@ -2,14 +2,14 @@
 
 Collision filters of a USD stage as pairs of bodies that must not collide: joints, FilteredPairsAPI, CollisionGroup.
 
-Whom a PhysicsFilteredPairsAPI filters is what its schema names, "a body or collision or even articulation" (UsdPhysics'
-schema.usda): a collider is that collider; a body is the colliders that it owns, not those of bodies nested below it; the root
-of an articulation (PhysicsArticulationRootAPI, "marks the subtree rooted here") is all bodies of the articulation, unless it
-is a body itself. The schema says nothing of other prims, so that a filter on or of one is dropped with a warning. Only the
-collection of a PhysicsCollisionGroup takes in what is below its members (Usd.CollectionAPI's `expandPrims`).
+A PhysicsFilteredPairsAPI filters the prims that its schema names, "a body or collision or even articulation" (UsdPhysics'
+schema.usda). A collider stands for itself. A body stands for its colliders, without the colliders of nested bodies. The root
+of an articulation (PhysicsArticulationRootAPI, "marks the subtree rooted here") stands for all its bodies, unless it is a body
+itself. The schema does not define other prims: a filter on or to one is dropped with a warning. Only the collection of a
+PhysicsCollisionGroup includes prims below its members (Usd.CollectionAPI's `expandPrims`).
 
-`newton:selfCollisionEnabled` or `physxArticulation:enabledSelfCollisions` false on an articulation's root keeps all of its
-bodies from each other.
+`newton:selfCollisionEnabled` or `physxArticulation:enabledSelfCollisions` false on an articulation's root disables collisions
+between its bodies.
 """
 
 from __future__ import annotations
@@ -44,16 +44,15 @@ class TreeNode:
 class SpanningTree:
     """A spanning tree of all bodies.
 
-    A kinematic body is a root. Else a group of joined bodies is attached to the world by one of its joints to it (by the marked
-    one, or one below the marked prim, if there are several); without any, its root is the marked body, or else one that is
-    nobody's body 1. Of the joints of a loop, one without drive and limits is left out, the last one in stage order, and a
-    prismatic one only if there is no other. Joints that are excluded from articulations are only in the tree where nothing
-    else holds a group. Joints of MuJoCo (MjcJointAPI) and those of an articulation whose joints add mobility stack: several
-    between the same two bodies are the degrees of freedom of one.
+    A kinematic body is a root. Any other group of joined bodies hangs on the world by one of its joints to it; with several, by
+    the marked joint or one below the marked prim. Without any, its root is the marked body, or else one that is no joint's
+    body 1. A loop is cut at its last joint in stage order without drive and limits, at a prismatic one only if there is no
+    other. Joints excluded from articulations enter the tree only where nothing else holds a group. Joints with MjcJointAPI, or
+    in an articulation whose joints add mobility, stack: several between the same bodies are degrees of freedom of one.
 
     Attributes:
         nodes: By body, depth first and siblings in stage order, which is MuJoCo's order.
-        loops: Joints that are not in the tree: they close a loop, or are equality constraints of MuJoCo.
+        loops: Joints outside the tree: they close a loop, or are equality constraints of MuJoCo.
     """
 
     def __init__(self, stage: Stage, joints: Iterable[Joint]):
@@ -103,7 +102,7 @@ class SpanningTree:
     def _groups(self) -> list[list[str]]:
         """Return connected components over articulated joints, in stage order, and keep the joints that close no loop."""
         group_of = {body: [body] for body in self._kinematic}
-        # By what is lost if they close a loop: an equality constraint can neither slide, nor be driven or limited.
+        # Cut loops at joints that lose least: an equality constraint can neither slide, nor be driven or limited.
         for joint in sorted(self._joints, key=lambda joint: (joint.kind != "slide", joint.drive is None, joint.range is None)):
             first, second = joint.bodies
             if first is not None and second is not None and not joint.is_excluded and group_of[first] is not group_of[second]:

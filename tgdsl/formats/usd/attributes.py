@@ -1,16 +1,16 @@
 """Attributes of MJCF elements: MuJoCo's arrays with their values, and the USD attributes; one table reads and writes them.
 
-Several schemas say the same: our own `tgdsl:`, MuJoCo's `mjc:`, Newton's `newton:`, PhysX's `physx…:` and UsdPhysics, in this
-order. The first that is authored is taken; one that says something else is dropped with a warning. A value that the schema
-calls its engine's choice (`-inf`, `-1`) says nothing.
+Several schemas define the same value: our `tgdsl:`, MuJoCo's `mjc:`, Newton's `newton:`, PhysX's `physx…:` and UsdPhysics, in
+this order. The first authored one counts; a contradicting one is dropped with a warning. A value that the schema leaves to its
+engine (`-inf`, `-1`) counts as unauthored.
 
-Names and units are those of the schemas MjcPhysics, as in mujoco-usd-converter 0.8, and of newton-usd-schemas 0.6: `newton:`
-counts in the stage's units and in degrees; `mjc:` holds MJCF's own values, in SI, of which `ref` and `springref` of a hinge are
-in the unit that `mjc:compiler:angle` names. Where MjcPhysics calls an attribute deprecated, its Newton successor is read too.
+Names and units follow the schemas of MjcPhysics, as in mujoco-usd-converter 0.8, and newton-usd-schemas 0.6. `newton:` uses
+the stage's units and degrees. `mjc:` holds MJCF's values, in SI; `ref` and `springref` of a hinge are in the unit of
+`mjc:compiler:angle`. Where MjcPhysics deprecates an attribute, its Newton successor is read too.
 
-`tgdsl:<MJCF's name>` is what MuJoCo has and USD has no schema for, in SI and radians whatever the stage's units; MuJoCo's
-defaults are not written. A value that USD keeps in float32 has a twin in double, `tgdsl:<USD's own name>`, in USD's unit. It
-counts as long as USD's value is what it rounds to: who edits the stage edits USD's.
+`tgdsl:<MJCF's name>` holds MuJoCo's values without a USD schema, in SI and radians whatever the stage's units; MuJoCo's
+defaults are not written. A value that USD stores in float32 has a copy in double, `tgdsl:<USD's own name>`, in USD's unit. The
+copy counts only while it rounds to USD's value, so that edits of USD's value win.
 """
 
 from __future__ import annotations
@@ -63,12 +63,12 @@ class Source:
 
     name: str  # the attribute's name; with `is_range`, what precedes `:min` and `:max`
     unit: str = "1"  # its unit, a key of `units`
-    neutral: float | None = None  # a value that says nothing
+    neutral: float | None = None  # a value that counts as unauthored
     is_range: bool = False  # whether two attributes hold the ends of a range
-    is_rate: bool = False  # whether it is a whole number of steps per second, whose inverse is meant
+    is_rate: bool = False  # whether it is an integer number of steps per second, to be inverted
 
     def value(self, stage: Stage, prim: Prim, is_angular: bool) -> Any:
-        """Return the value in MJCF's unit, or None if nothing is said."""
+        """Return the value in MJCF's unit, or None if none is authored."""
         if self.is_range:
             ends = [stage.authored(prim, f"{self.name}:{end}") for end in ("min", "max")]
             return None if ends == [None, None] else [float(end or 0.0) for end in ends]
@@ -190,14 +190,14 @@ ACTUATOR: Table = {
     **{name: Row(f"actuator_{name}") for name in ("delay", "armature", "damping")},
     "nsample": Row(),
 }
-"""What has no source, MjcPhysics does not have."""
+"""Rows without a source have no attribute in MjcPhysics."""
 SERVO: Table = {
     "kp": Row("", (Source("newton:kp", "inertia"),)),
     "kd": Row("", (Source("newton:kd", "inertia"),)),
     "constant": Row("", (Source("newton:constEffort", "effort"),)),
     "most": Row("", (Source("newton:maxEffort", "effort", neutral=math.inf),)),
 }
-"""Of a NewtonActuator, whose gains are per radian: kg·m² or kg of the stage, over s² or s, as an inertia is."""
+"""NewtonActuator: gains per radian, in the stage's kg·m² or kg, over s² or s, like an inertia."""
 TENDON: Table = {
     **{
         name: mjc(name, array=f"tendon_{name}")
@@ -307,7 +307,7 @@ def set_custom(prim: Any, key: str, value: str | bool | int | float | tuple[floa
 
 
 def set_customs(prim: Any, table: Table, element: Any, default: Any, index: int | None = None) -> None:
-    """Set custom attributes for fields, or rows `index` of arrays, that differ from those of an element with defaults."""
+    """Set custom attributes for fields, or rows `index` of arrays, that differ from an element with defaults."""
     for attribute, row in table.items():
         if not row.array:
             continue

@@ -1,13 +1,13 @@
-"""Equality constraints, read and written, each as what USD and the schemas of MuJoCo and Newton have for it.
+"""Equality constraints, read and written by the schemas of USD, MuJoCo and Newton.
 
 - `connect` and `weld`: a spherical or fixed joint outside of the articulation, with MjcEqualityConnectAPI or
   MjcEqualityWeldAPI; it joins the bodies, or the sites, that the constraint names.
 - A joint that follows another: NewtonMimicAPI and MjcEqualityJointAPI on the follower, in USD's positions, which are MuJoCo's:
   MJCF counts both positions from `qpos0`.
-- What has no schema is a Scope that only tgdsl reads, MJCF's values in custom attributes: constraints of tendons, of a joint
-  without a leader, and all but the first of a joint that follows several.
+- Constraints without a schema are Scopes that only tgdsl reads, with MJCF's values in custom attributes: constraints of
+  tendons, of a joint without a leader, and of a joint with several leaders after its first.
 
-`tgdsl:equality` is a constraint's place in MuJoCo's order, `tgdsl:equality_name` its name. Those of flexes are left out.
+`tgdsl:equality` is a constraint's place in MuJoCo's order, `tgdsl:equality_name` its name. Constraints of flexes are skipped.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def read_couplings(stage: Stage, equality: ET.Element, joints: Iterable[Joint], 
                 raise stage.error(prim, f"{name} has {len(targets)} targets, {listed(targets)}; expected one, which it follows")
             leaders += targets
         if joint.path not in names or not leaders or leaders[0] not in names:
-            stage.drop("couplings were dropped of which the leader or the follower is no revolute or prismatic joint", prim)
+            stage.drop("couplings were dropped whose leader or follower is no revolute or prismatic joint", prim)
             continue
         if len(set(leaders)) > 1:
             stage.drop("newton:mimicJoint was dropped, which contradicts mjc:target", prim)
@@ -164,11 +164,11 @@ def _write_closing_joint(writer: attr.StageWriter, equality: int, is_weld: bool)
     """Write a `connect` or `weld`; its frames are where MuJoCo holds both ends together."""
     model, physics = writer.model, usd_modules().UsdPhysics
     schema, kind = (physics.FixedJoint, "Weld") if is_weld else (physics.SphericalJoint, "Connect")
-    made = schema.Define(writer.stage, writer.path(writer.scope, model.equality(equality).name or kind.lower()))
-    prim, ends = made.GetPrim(), (int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality]))
+    joint = schema.Define(writer.stage, writer.path(writer.scope, model.equality(equality).name or kind.lower()))
+    prim, ends = joint.GetPrim(), (int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality]))
     prim.AddAppliedSchema(f"MjcEquality{kind}API")
     is_of_sites = model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE
-    for end, create in zip(ends, (made.CreateBody0Rel, made.CreateBody1Rel), strict=True):
+    for end, create in zip(ends, (joint.CreateBody0Rel, joint.CreateBody1Rel), strict=True):
         if is_of_sites or end:  # a joint without one of its bodies holds the other in the world
             create().SetTargets([(writer.sites if is_of_sites else writer.bodies)[end]])
     data = np.zeros(11) if is_of_sites else model.eq_data[equality]
@@ -176,11 +176,11 @@ def _write_closing_joint(writer: attr.StageWriter, equality: int, is_weld: bool)
     points = (data[3:6], data[0:3]) if is_weld else (data[0:3], data[3:6])
     turn = data[6:10] if is_weld and data[6:10].any() else np.array([1.0, 0.0, 0.0, 0.0])
     for number, (point, quat) in enumerate(zip(points, (turn, np.array([1.0, 0.0, 0.0, 0.0])), strict=True)):
-        attr.set_number(getattr(made, f"CreateLocalPos{number}Attr")(), point)
-        attr.set_number(getattr(made, f"CreateLocalRot{number}Attr")(), quat)
-    made.CreateExcludeFromArticulationAttr(True)
-    made.CreateCollisionEnabledAttr(True)
-    made.CreateJointEnabledAttr(bool(model.eq_active0[equality]))
+        attr.set_number(getattr(joint, f"CreateLocalPos{number}Attr")(), point)
+        attr.set_number(getattr(joint, f"CreateLocalRot{number}Attr")(), quat)
+    joint.CreateExcludeFromArticulationAttr(True)
+    joint.CreateCollisionEnabledAttr(True)
+    joint.CreateJointEnabledAttr(bool(model.eq_active0[equality]))
     if is_weld and model.eq_data[equality, 10] != 1.0:
         attr.set_number(_float(prim, "mjc:torqueScale"), model.eq_data[equality, 10])
     return prim

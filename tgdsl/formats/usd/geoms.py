@@ -73,9 +73,9 @@ def _is_site(stage: Stage, prim: Prim) -> bool:
 
 
 def read_gprims(stage: Stage) -> list[Gprim]:
-    """Read all colliders and all that is visible."""
+    """Read all colliders and all visible shapes."""
     geoms: list[Gprim] = []
-    instancer = "//"  # what is below a point instancer is only there as its instances
+    instancer = "//"  # prims below a point instancer are its prototypes, which exist only as instances
     for prim in stage.prims:
         if str(prim.GetPath()).startswith(instancer) or _is_site(stage, prim):
             continue
@@ -262,7 +262,7 @@ def _authored(stage: Stage, prim: Prim) -> _Authored:
 
 
 def _with_zeros(stage: Stage, body: Prim, authored: _Authored) -> Inertial | None:
-    """Return the mass and inertia of which some are zero, as `export` wrote them: mass, moments and axes (w x y z)."""
+    """Return a mass and inertia with zeros as `export` wrote them: mass, moments and axes (w x y z)."""
     values = np.array(read_custom(stage, body, "inertial") or (), dtype=np.float64)
     if not values.size or authored.tensor is not None or np.float32(authored.mass) != np.float32(values[0]):
         return None
@@ -333,13 +333,13 @@ def _sum(parts: list[Inertial]) -> Inertial | None:
 
 
 def _fallback_inertial(stage: Stage, body: Prim, mass: float, geoms: Sequence[Gprim]) -> Inertial:
-    """Return the inertia of a body of which only the mass is known: that of its visuals as solids, or of a ball."""
+    """Return the inertia of a body with only a known mass: of its visuals as solids, or of a ball."""
     solids = [geom.shape.mass_properties(False) for geom in geoms if geom.shape.kind != "plane"]
     whole = _sum([Inertial(*solid) for solid in solids if solid[0] > 0])
     if whole is not None:
-        stage.drop("bodies have a mass but neither inertia nor colliders; their visuals were taken as solid", body)
+        stage.drop("bodies have a mass but neither inertia nor colliders; their visuals count as solid", body)
         return Inertial(mass, whole.centre, whole.tensor * (mass / whole.mass))
-    stage.drop(f"bodies have a mass but neither inertia nor geometry; a ball of {FALLBACK_RADIUS} m radius was taken", body)
+    stage.drop(f"bodies have a mass but neither inertia nor geometry; they count as a ball of {FALLBACK_RADIUS} m radius", body)
     return Inertial(mass, np.zeros(3), 0.4 * mass * FALLBACK_RADIUS**2 * np.eye(3))
 
 

@@ -25,7 +25,7 @@ CONSTRAINTS = ("MjcEqualityConnectAPI", "MjcEqualityWeldAPI")
 FORCES = ("damping", "armature", "frictionloss", "stiffness", "springdamper")
 """Attributes of an MJCF joint that an equality constraint does not have."""
 KINDS = {"PhysicsRevoluteJoint": "hinge", "PhysicsPrismaticJoint": "slide", "PhysicsSphericalJoint": "ball"}
-"""MuJoCo's joints by the schemas of UsdPhysics; fixed, generic and distance joints are seen to one by one."""
+"""MuJoCo's joints by the schemas of UsdPhysics; fixed, generic and distance joints are handled separately."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Drive:
     actuator: str = ""  # name of its actuator, or empty: the joint's
     control: Range | None = None  # range of the target, or None if it is free
     gear: float = 1.0  # the actuator's control is the target times this; it enters its gains twice, its force once
-    order: float = math.inf  # place of its actuator among those that say so; the others come after them
+    order: float = math.inf  # place of its actuator among the actuators with an order; the others follow
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +56,9 @@ class Joint:
     frames: tuple[Matrix, Matrix]  # the joint frame in the frames of body 0 and of body 1 [m]; they coincide at position zero
     range: Range | None  # least and greatest position [rad or m], or None if it has no limits
     drive: Drive | None  # what drives it
-    is_excluded: bool  # whether it is kept out of the articulation
+    is_excluded: bool  # whether it is excluded from the articulation
     is_filtering: bool | None  # whether the bodies must not collide; None: MuJoCo's filter decides
-    is_stackable: bool  # whether it adds its motion to that of other joints between the same two bodies
+    is_stackable: bool  # whether its motion adds to other joints between the same two bodies
     constraint: str  # if it is an equality constraint of MuJoCo, its schema; or empty
     is_active: bool  # whether that constraint is active
     mjcf_attributes: dict[str, str]  # more attributes of the MJCF joint, its own damping, armature and dry friction among them
@@ -240,7 +240,7 @@ def _side(stage: Stage, prim: Prim, side: int) -> tuple[str | None, Matrix, str]
     if len(targets) > 1:
         raise stage.error(prim, f"physics:body{side} has {len(targets)} targets; expected one at most")
     target = stage.usd.GetPrimAtPath(targets[0]) if targets else stage.usd.GetPseudoRoot()
-    if not target or str(target.GetPath()) not in stage.owners:  # an inactive prim is found, but is not there
+    if not target or str(target.GetPath()) not in stage.owners:  # USD returns inactive prims too
         raise stage.error(prim, f"physics:body{side} names {targets[0]}, which does not exist")
     body = stage.owners[str(target.GetPath())]
     frame, scale = stage.frame(target)

@@ -1,9 +1,9 @@
 """USD in: a UsdPhysics stage becomes MJCF.
 
-The semantics are those of the UsdPhysics schemas; of MuJoCo's own (`mjc:`) and Newton's (`newton:`) where they are authored,
-whose plugins need not be installed. Where several say the same, the most specific counts: `tgdsl:`, `mjc:`, `newton:`,
-`physx…:`, UsdPhysics, in this order; who contradicts it is warned of (`attributes.py`). Exceptions are what a user edits in
-a stage that `export` wrote: UsdPhysics' value of a drive, a friction or a mass overrules our exact copy of the old one.
+The semantics follow the UsdPhysics schemas, and MuJoCo's (`mjc:`) and Newton's (`newton:`) where they are authored; their
+plugins need not be installed. Of several values the most specific counts: `tgdsl:`, `mjc:`, `newton:`, `physx…:`, UsdPhysics,
+in this order; a contradiction causes a warning (`attributes.py`). Exception: a user's edits of a stage that `export` wrote.
+There UsdPhysics' value of a drive, a friction or a mass overrules our exact copy of the old one.
 
 Where MuJoCo leaves a choice:
 
@@ -11,22 +11,22 @@ Where MuJoCo leaves a choice:
 - Position zero is where the frames of a joint meet, with `mjc:ref` the position `ref`. If the authored poses or the drives'
   targets differ from where the model starts, the keyframe `authored` has them. Limits are MuJoCo's positions.
 - A drive becomes a `position` actuator, or a `velocity` actuator if it has no stiffness, named after its joint. A drive
-  without gains exerts no force and gives none. What `tgdsl:damping` says is the joint's own is taken off the drive's;
-  `mjc:damping` and `newton:damping` are beside it. A prim MjcActuator or NewtonActuator on the joint is that same actuator,
-  said more exactly: the drive is left out, with a warning if it contradicts.
+  without gains exerts no force and becomes no actuator. `tgdsl:damping` is the joint's share of the drive's damping;
+  `mjc:damping` and `newton:damping` add to it. A prim MjcActuator or NewtonActuator on the joint is the same actuator with
+  more detail: it replaces the drive, with a warning if they contradict.
 - Several joints between the same two bodies are degrees of freedom of one, where MjcJointAPI or `newton:jointsAddMobility` says
-  that joints add mobility; else all but one close a loop.
+  that joints add mobility; else one holds the body and the others close loops.
 - Sliding friction is a material's dynamic friction, or its static friction if only that is authored; MuJoCo takes the greater
   of two, and its own default where no material is bound. `newton:contactStiffness` and `contactDamping` are not read: they are
   a force per distance, MuJoCo's `solref` is per effective mass.
 - A joint that closes a loop, or has MjcEqualityConnectAPI or MjcEqualityWeldAPI, becomes an equality constraint between sites;
-  one that `export` wrote is again between the bodies that it had.
-- Whether a parent and its child collide is what their joint says; where it says nothing and the scene has MjcSceneAPI,
-  MuJoCo's own filter of parents (`mjc:flag:filterparent`) decides.
-- Colliders are in group 0 if they are visible and in group 3 if not, other visuals in group 2; or as `mjc:group` says.
-- Materials' looks, subdivision, holes of meshes and what is not drawn by default are left out. Whatever else is authored and
-  nobody has read is warned of, by attribute and prim (`note_unread`).
-- Custom attributes `tgdsl:` that `export` writes are read back, in SI units and radians whatever those of the stage.
+  one that `export` wrote connects the original bodies again.
+- A joint decides whether its parent and child collide; where it does not and the scene has MjcSceneAPI, MuJoCo's filter of
+  parents (`mjc:flag:filterparent`) decides.
+- `mjc:group` sets a geom's group; default: 0 for visible colliders, 3 for invisible ones, 2 for other visuals.
+- Materials' looks, subdivision, holes of meshes and prims not drawn by default are skipped. Any other unread authored
+  attribute causes a warning with its name and prim (`note_unread`).
+- Custom attributes `tgdsl:` that `export` writes are read back, in SI units and radians whatever the stage's units.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ from tgdsl.formats.usd.stage import NAME_ATTRIBUTE, Matrix, Names, Prim, Stage, 
 
 AXIS_ARM = 0.05  # distance between the two connect constraints along the axis of a revolute joint that closes a loop [m]
 REST_TOLERANCE = 1e-6  # largest authored position without a keyframe [rad or m]: it is rounding of float32
-VISIBLE, VISUAL, HIDDEN = "0", "2", "3"  # groups of visible colliders, of visuals that do not collide, of what is invisible
+VISIBLE, VISUAL, HIDDEN = "0", "2", "3"  # groups: visible colliders; visuals that do not collide; invisible colliders
 FRICTION = (1.0, 0.005, 0.0001)  # MuJoCo's default friction of a geom
 
 
@@ -369,13 +369,13 @@ def _pose(pose: Matrix) -> dict[str, str]:
 
 
 def _friction(geom: Gprim) -> str | None:
-    """Return the frictions of a geom: sliding as its material says, the others as `tgdsl:friction`, or else its material."""
+    """Return a geom's frictions: sliding from its material, torsional and rolling from `tgdsl:friction`, or its material."""
     custom = [float(value) for value in geom.mjcf_attributes.get("friction", "").split()]
-    sliding, *others = geom.friction
+    sliding, *rest = geom.friction
     if not custom and geom.friction == (None, None, None):
         return None
     values = [sliding if sliding is not None else (custom or FRICTION)[0]]
-    for number, other in enumerate(others, start=1):
+    for number, other in enumerate(rest, start=1):
         values.append(custom[number] if len(custom) > number else FRICTION[number] if other is None else other)
     return text_of(values)
 
@@ -396,7 +396,7 @@ def add_scene(stage: Stage, option: ET.Element, compiler: ET.Element) -> dict[st
         option.set("timestep", text_of(NEWTON_TIMESTEP))
     compiler.attrib |= read_attributes(stage, scene, COMPILER)
     if stage.compiler("inertiaFromGeom") == "true":
-        stage.drop("mjc:compiler:inertiaFromGeom is true; masses are those that bodies and colliders state", scene)
+        stage.drop("mjc:compiler:inertiaFromGeom is true; masses come from bodies and colliders", scene)
     ends = [stage.compiler(f"inertiaGroupRange:{end}") for end in ("min", "max")]
     if (ends[0] or 0) > 0 or (ends[1] is not None and ends[1] < 5):
         stage.drop("mjc:compiler:inertiaGroupRange was dropped: all colliders have a mass, in whatever group", scene)

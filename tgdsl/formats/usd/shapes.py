@@ -86,9 +86,9 @@ class Shape:
             geom.size[: len(self.size)] = self.size
             if model:
                 geom.typeinertia = mujoco.mjtGeomInertia.mjINERTIA_SHELL
-        made = spec.compile()
-        axes = Rotation.from_quat(made.body_iquat[1], scalar_first=True).as_matrix()
-        return float(made.body_mass[1]), made.body_ipos[1].copy(), axes @ np.diag(made.body_inertia[1]) @ axes.T
+        compiled = spec.compile()
+        axes = Rotation.from_quat(compiled.body_iquat[1], scalar_first=True).as_matrix()
+        return float(compiled.body_mass[1]), compiled.body_ipos[1].copy(), axes @ np.diag(compiled.body_inertia[1]) @ axes.T
 
 
 def shape_of(stage: Stage, prim: Prim, place: Matrix) -> Shape:
@@ -142,7 +142,7 @@ def _scales(scale: Float[np.ndarray, " 3"] | None, axis: str) -> tuple[float, fl
 
 
 def mesh_shape(vertices: Vertices, faces: Faces, place: Matrix) -> Shape:
-    """Return a mesh: its scale goes into its vertices, and what is left of the transform into its pose."""
+    """Return a mesh: its scale goes into its vertices, the rest of the transform into its pose."""
     linear, pose = place[:3, :3], place.copy()
     if np.linalg.det(linear) < 0:
         faces = faces[:, ::-1]
@@ -198,15 +198,15 @@ def _plane_shape(stage: Stage, prim: Prim, place: Matrix) -> Shape:
 
 
 def collision_shape(stage: Stage, prim: Prim, shape: Shape, place: Matrix) -> tuple[Shape, bool]:
-    """Return what a mesh collides as, and whether that is the mesh's hull because of its `physics:approximation`."""
-    wanted = "none"
+    """Return a mesh's collision shape, and whether it is the mesh's hull because of its `physics:approximation`."""
+    approximation = "none"
     if stage.has(prim, "PhysicsMeshCollisionAPI"):
-        wanted = str(stage.value(prim, "physics:approximation"))
+        approximation = str(stage.value(prim, "physics:approximation"))
     assert shape.vertices is not None
-    if wanted in ("boundingCube", "boundingSphere"):
+    if approximation in ("boundingCube", "boundingSphere"):
         points = read_mesh(stage, prim)[0]
         low, high = points.min(axis=0), points.max(axis=0)
-        if wanted == "boundingCube":
+        if approximation == "boundingCube":
             return box_shape(low, high, place), False
         centre = place[:3, :3] @ ((low + high) / 2) + place[:3, 3]
         placed = points @ place[:3, :3].T + place[:3, 3]
@@ -215,9 +215,9 @@ def collision_shape(stage: Stage, prim: Prim, shape: Shape, place: Matrix) -> tu
         return Shape("sphere", (float(np.linalg.norm(placed - centre, axis=1).max()),), pose), False
     if shape.hull is None:
         raise stage.error(prim, "the mesh is flat: it has no hull to collide; use a plane or a thin box")
-    if wanted != "convexHull" and not shape.is_convex:
-        stage.drop(f'meshes with approximation "{wanted}" collide as their convex hulls', prim)
-    return shape, wanted == "convexHull"
+    if approximation != "convexHull" and not shape.is_convex:
+        stage.drop(f'meshes with approximation "{approximation}" collide as their convex hulls', prim)
+    return shape, approximation == "convexHull"
 
 
 def read_mesh(stage: Stage, prim: Prim) -> tuple[Vertices, Faces]:
@@ -276,10 +276,10 @@ def _is_ear(flat: Float[np.ndarray, "corner 2"], left: list[int], at: int) -> bo
     a, b, c = flat[left[at - 1]], flat[left[at]], flat[left[(at + 1) % len(left)]]
     if _cross(b - a, c - b) <= 0:
         return False
-    others = flat[[i for i in left if not any(np.array_equal(flat[i], corner) for corner in (a, b, c))]]
-    if not len(others):
+    rest = flat[[i for i in left if not any(np.array_equal(flat[i], corner) for corner in (a, b, c))]]
+    if not len(rest):
         return True
-    sides = np.stack([_cross(q - p, others - p) for p, q in ((a, b), (b, c), (c, a))])
+    sides = np.stack([_cross(q - p, rest - p) for p, q in ((a, b), (b, c), (c, a))])
     return not (sides >= 0).all(axis=0).any()
 
 

@@ -1,4 +1,4 @@
-"""An opened USD stage: composition errors, units and up-axis, transforms in metres with Z up, names, and what is dropped."""
+"""An opened USD stage: composition errors, units and up-axis, transforms in metres with Z up, names, dropped elements."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ IMPLIED = {
     "NewtonMassAPI": ("PhysicsMassAPI",),
     "NewtonMaterialAPI": ("PhysicsMaterialAPI",),
 }
-"""API schemas by those that build them in (MjcPhysics of mujoco-usd-converter 0.8, newton-usd-schemas 0.6); usd-core only knows
-this of schemas whose plugins are installed."""
+"""Built-in API schemas of each schema (MjcPhysics of mujoco-usd-converter 0.8, newton-usd-schemas 0.6); usd-core knows them
+only with the schema's plugin."""
 IMPLIED_PHYSICS = frozenset(name for names in IMPLIED.values() for name in names if name.startswith("Physics"))
 NAMESPACE = "tgdsl:"  # namespace of the custom attributes that hold MJCF's values
 NAME_ATTRIBUTE = f"{NAMESPACE}name"  # a custom string attribute of a prim: the name that it has in MJCF
@@ -60,7 +60,7 @@ class Stage:
     file: Path  # the file that it came from
     usd: Any  # the `pxr.Usd.Stage`
     pxr: Any  # the modules of usd-core
-    dropped: dict[str, list[str]] = field(default_factory=dict)  # prim paths by what was dropped of them, in the order found
+    dropped: dict[str, list[str]] = field(default_factory=dict)  # paths of prims by message about a dropped part, in order
     read: set[tuple[str, str]] = field(default_factory=set)  # paths of prims and names of properties that were read
 
     @cached_property
@@ -80,7 +80,7 @@ class Stage:
 
     @cached_property
     def owners(self) -> dict[str, str | None]:
-        """For the path of each prim, that of the rigid body which it moves with; None is the world."""
+        """Path of the rigid body that each prim moves with, by the prim's path; None is the world."""
         owners: dict[str, str | None] = {"/": None}
         for prim in self.prims:
             path = str(prim.GetPath())
@@ -131,7 +131,7 @@ class Stage:
 
     @cached_property
     def _time(self) -> Any:
-        # What is only authored as time samples starts where they start.
+        # Attributes with only time samples start at the first.
         return self.pxr.Usd.TimeCode.EarliestTime()
 
     @cached_property
@@ -154,7 +154,7 @@ class Stage:
         return self.value(prim, name) if attribute and attribute.HasAuthoredValue() else None
 
     def targets(self, prim: Prim, name: str) -> list[str]:
-        """Return the paths that a relationship names, through those that it forwards to."""
+        """Return the paths that a relationship names, with forwarded relationships resolved."""
         self.note(prim, name)
         relationship = prim.GetRelationship(name)
         return [str(path) for path in relationship.GetForwardedTargets()] if relationship else []
@@ -164,7 +164,7 @@ class Stage:
         self.read.update((path, name) for name in names)
 
     def schemas(self, prim: Prim) -> frozenset[str]:
-        """Return all API schemas of a prim: those that it names, known to usd-core or not, and those that these imply."""
+        """Return all API schemas of a prim: applied ones, known to usd-core or not, and the ones that they imply."""
         path = str(prim.GetPath())
         if path not in self._schemas:
             names = [*prim.GetPrimTypeInfo().GetAppliedAPISchemas(), *prim.GetAppliedSchemas()]
@@ -269,7 +269,7 @@ def open_stage(path: Path) -> Iterator[Stage]:
         for diagnostic in printed.TakeUncoalescedDiagnostics():
             warnings.warn(f"{path}: USD: {' '.join(diagnostic.commentary.split())}", stacklevel=4)
     finally:
-        printed.TakeUncoalescedDiagnostics()  # what is left in the delegate is printed when it goes
+        printed.TakeUncoalescedDiagnostics()  # the delegate prints any left when it is deleted
         del printed
 
 
@@ -293,7 +293,7 @@ def unique_names(stage: Stage, prims: Iterable[Prim], reserved: Iterable[str] = 
     for prim in prims:
         name = stage.authored(prim, NAME_ATTRIBUTE)
         if name and taken[str(name)]:
-            stage.drop(f"names in {NAME_ATTRIBUTE} were dropped that are taken", prim)
+            stage.drop(f"duplicate names in {NAME_ATTRIBUTE} were dropped", prim)
         elif name:
             names[str(prim.GetPath())] = str(name)
             taken[str(name)] += 1
@@ -307,7 +307,7 @@ def unique_names(stage: Stage, prims: Iterable[Prim], reserved: Iterable[str] = 
             break
         for path in longer:
             depth[path] += 1
-    for path, name in ends.items():  # only `/a/b_c` beside `/a_b/c` still share one
+    for path, name in ends.items():  # only pairs like `/a/b_c` and `/a_b/c` still share one
         free, number = name, 1
         while taken[free]:
             number += 1
@@ -388,7 +388,7 @@ DRAWN_TYPES = ("Shader", "NodeGraph", "GeomSubset", "Camera", "Skel", "Render", 
 
 
 def note_unread(stage: Stage) -> None:
-    """Record what was authored and not read, for the warnings when the stage is closed. Nothing may be read after this."""
+    """Record authored properties that were not read, for the warnings on closing. Nothing may be read after this."""
     for prim in stage.prims:
         kind = str(prim.GetTypeName())
         if kind.startswith(DRAWN_TYPES) or kind.endswith("Light"):
@@ -396,7 +396,7 @@ def note_unread(stage: Stage) -> None:
         is_collider, is_joint = stage.has(prim, "PhysicsCollisionAPI"), prim.IsA(stage.pxr.UsdPhysics.Joint)
         switches = (("physics:jointEnabled", is_joint), ("physics:collisionEnabled", is_collider))
         if any(is_there and stage.value(prim, name) is False for name, is_there in switches):
-            continue  # what is disabled has no meaning
+            continue  # a disabled joint or collider has no effect
         if stage.owners[str(prim.GetPath())] is None:  # the world's parts have no mass
             stage.note(prim, *MASS)
         if kind not in KNOWN_TYPES:

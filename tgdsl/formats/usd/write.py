@@ -1,12 +1,12 @@
 """Robots out: a compiled MJCF or URDF model as a UsdPhysics stage, in SI units but where USD wants degrees.
 
-Bodies are siblings below the default prim, at their world poses. What USD has no schema for and tgdsl reads back is kept in
-custom attributes named `tgdsl:`, in SI units and radians:
+Bodies are siblings below the default prim, at their world poses. Custom attributes named `tgdsl:`, in SI units and radians,
+hold values without a USD schema, for tgdsl to read back:
 
 - the names of MuJoCo (`name`, `actuator`, `mesh`; a floating body's joint in `freejoint`), a geom's `group`, and which frame
   is a `site`;
 - a joint's own `damping`, which its drive's includes; its actuator's `ctrlrange`; the `gear`, which drive and range include;
-  a joint's `actuatorfrcrange` and its actuator's `forcerange`, of which the drive has the smaller;
+  a joint's `actuatorfrcrange` and its actuator's `forcerange` (the drive has the smaller);
   the actuator's place in the `order`, if actuators do not come in the joints' order or are not all drives;
 - a joint's spring, a ball joint's range, a body's `gravcomp`, and its `inertial` if its mass or some moment is zero;
 - contact parameters and the solver's settings, and the exact values of what USD rounds to float32: see `attributes.py`.
@@ -197,8 +197,8 @@ def _define(writer: attr.StageWriter, geom: int) -> tuple[Any, np.ndarray | None
     name, body = model.geom(geom).name, int(model.geom_bodyid[geom])
     mesh = model.mesh(model.geom_dataid[geom]).name if kind == "mesh" else ""
     if kind not in SCHEMAS:
-        shown = f'geom "{name}"' if name else f"unnamed {kind} geom {geom}"
-        raise RobotError(f"{writer.file}: {shown} of body {writer.body_name(body)} is of type {kind}, which USD does not have")
+        label = f'geom "{name}"' if name else f"unnamed {kind} geom {geom}"
+        raise RobotError(f"{writer.file}: {label} of body {writer.body_name(body)} is of type {kind}, which USD does not have")
     shape = getattr(shapes, SCHEMAS[kind]).Define(writer.stage, writer.path(writer.bodies[body], name or mesh or kind))
     if kind == "box":
         shape.CreateSizeAttr(2.0)
@@ -262,7 +262,7 @@ def _excluded(model: mujoco.MjModel) -> set[tuple[int, int]]:
 
 
 def _never_collide(model: mujoco.MjModel, one: int, two: int) -> bool:
-    """Return whether MuJoCo never collides two bodies: welded into one, or parent and child of which neither is fixed."""
+    """Return whether MuJoCo never collides two bodies: welded into one, or parent and child, neither fixed to the world."""
     one, two = int(model.body_weldid[one]), int(model.body_weldid[two])
     if one == two or not one or not two or model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
         return one == two
@@ -283,12 +283,12 @@ def _add_filters(writer: attr.StageWriter) -> None:
         if one:
             targets.setdefault(one, []).append(writer.bodies[two])
         elif one in writer.bodies:  # the world is no rigid body: each of its colliders is named
-            others = stage.GetPrimAtPath(writer.bodies[one]).GetChildren()
-            if walls := [str(other.GetPath()) for other in others if other.HasAPI(u.UsdPhysics.CollisionAPI)]:
+            children = stage.GetPrimAtPath(writer.bodies[one]).GetChildren()
+            if walls := [str(child.GetPath()) for child in children if child.HasAPI(u.UsdPhysics.CollisionAPI)]:
                 targets.setdefault(two, []).extend(walls)
-    for body, others in sorted(targets.items()):
+    for body, paths in sorted(targets.items()):
         filtered = u.UsdPhysics.FilteredPairsAPI.Apply(stage.GetPrimAtPath(writer.bodies[body]))
-        filtered.CreateFilteredPairsRel().SetTargets(others)
+        filtered.CreateFilteredPairsRel().SetTargets(paths)
 
 
 def _unsupported_elements(writer: attr.StageWriter) -> list[str]:

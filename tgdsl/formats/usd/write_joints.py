@@ -4,8 +4,8 @@ A USD joint holds a frame on each of its two bodies and turns about, or slides a
 pose in its parent at `qpos0` (as MuJoCo keeps it), L1 the frame on the child (at the joint's anchor, x along its axis) and M(q)
 the joint's own motion, the frame on the parent is L0 = T L1 M(-qpos0), so that the child stands at L0 M(q) L1⁻¹.
 
-A joint of USD has no damping of its own, but its drive has: the damping of a drive is that of the servo and of the joint
-together, and `tgdsl:damping` says how much of it is the joint's. A damped joint without a servo has a drive without stiffness.
+A USD joint has no damping, but its drive has: the drive's damping is the servo's plus the joint's, and `tgdsl:damping` holds
+the joint's share. A damped joint without a servo has a drive without stiffness.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def add_joint(writer: attr.StageWriter, body: int, collides: bool) -> None:
     if count > 1:
         raise RobotError(
             f'{writer.file}: body "{writer.body_name(body)}" has {count} joints, and a body in USD has one to its parent; '
-            "give each joint a body of its own"
+            "give each joint a separate body"
         )
     joint = int(model.body_jntadr[body]) if count else -1
     kind = int(model.jnt_type[joint]) if joint >= 0 else -1
@@ -45,28 +45,28 @@ def add_joint(writer: attr.StageWriter, body: int, collides: bool) -> None:
     name = model.joint(joint).name if joint >= 0 else ""
     physics = usd_modules().UsdPhysics
     path = writer.path(writer.scope, name or f"{writer.body_name(body)}_{'fixed' if joint < 0 else 'joint'}")
-    made = getattr(physics, SCHEMAS.get(kind, "FixedJoint")).Define(writer.stage, path)
-    attr.set_custom(made.GetPrim(), "name", name)
+    usd_joint = getattr(physics, SCHEMAS.get(kind, "FixedJoint")).Define(writer.stage, path)
+    attr.set_custom(usd_joint.GetPrim(), "name", name)
     parent = int(model.body_parentid[body])
     if parent:  # a joint without its first body holds the second in the world
-        made.CreateBody0Rel().SetTargets([writer.bodies[parent]])
-    made.CreateBody1Rel().SetTargets([writer.bodies[body]])
+        usd_joint.CreateBody0Rel().SetTargets([writer.bodies[parent]])
+    usd_joint.CreateBody1Rel().SetTargets([writer.bodies[body]])
     if collides:
-        made.CreateCollisionEnabledAttr(True)
-    _frames(writer, body, joint, made)
+        usd_joint.CreateCollisionEnabledAttr(True)
+    _frames(writer, body, joint, usd_joint)
     if joint < 0:
         return
     if kind in (attr.SLIDE, attr.HINGE):
-        made.CreateAxisAttr("X")
+        usd_joint.CreateAxisAttr("X")
         low, high = model.jnt_range[joint].tolist() if model.jnt_limited[joint] else (-math.inf, math.inf)
         unit = math.degrees(1.0) if kind == attr.HINGE else 1.0
-        attr.set_number(made.CreateLowerLimitAttr(), low * unit)
-        attr.set_number(made.CreateUpperLimitAttr(), high * unit)
-    _passive(model, joint, made.GetPrim())
-    writer.joints[joint] = made
+        attr.set_number(usd_joint.CreateLowerLimitAttr(), low * unit)
+        attr.set_number(usd_joint.CreateUpperLimitAttr(), high * unit)
+    _passive(model, joint, usd_joint.GetPrim())
+    writer.joints[joint] = usd_joint
 
 
-def _frames(writer: attr.StageWriter, body: int, joint: int, made: Any) -> None:
+def _frames(writer: attr.StageWriter, body: int, joint: int, usd_joint: Any) -> None:
     model = writer.model
     pos, turn = np.zeros(3), Rotation.identity()
     kind = int(model.jnt_type[joint]) if joint >= 0 else -1
@@ -83,8 +83,8 @@ def _frames(writer: attr.StageWriter, body: int, joint: int, made: Any) -> None:
         parent_turn = parent_turn * Rotation.from_rotvec([-rest, 0.0, 0.0])
     for number, (place, rotation) in enumerate(((parent_pos, parent_turn), (pos, turn))):
         quat = rotation.as_quat(canonical=True, scalar_first=True)
-        attr.set_number(getattr(made, f"CreateLocalPos{number}Attr")(), attr.rounded(place))
-        attr.set_number(getattr(made, f"CreateLocalRot{number}Attr")(), attr.rounded(quat))
+        attr.set_number(getattr(usd_joint, f"CreateLocalPos{number}Attr")(), attr.rounded(place))
+        attr.set_number(getattr(usd_joint, f"CreateLocalRot{number}Attr")(), attr.rounded(quat))
 
 
 def _x_to(axis: np.ndarray) -> Rotation:
@@ -106,10 +106,10 @@ def _passive(model: mujoco.MjModel, joint: int, prim: Any) -> None:
         attr.set_custom(prim, "springref", float(model.qpos_spring[model.jnt_qposadr[joint]]))
     if model.jnt_type[joint] == attr.BALL and model.jnt_limited[joint]:
         attr.set_custom(prim, "range", model.jnt_range[joint].tolist())
-    known = {"armature": model.dof_armature[first], "jointFriction": model.dof_frictionloss[first]}
-    if any(known.values()):
+    physx = {"armature": model.dof_armature[first], "jointFriction": model.dof_frictionloss[first]}
+    if any(physx.values()):
         prim.AddAppliedSchema("PhysxJointAPI")  # Omniverse reads the attributes only of a prim that says so
-    for key, value in known.items():
+    for key, value in physx.items():
         if value:
             attribute = prim.CreateAttribute(f"physxJoint:{key}", usd_modules().Sdf.ValueTypeNames.Float, custom=True)
             attr.set_number(attribute, value)
@@ -121,7 +121,7 @@ def _passive(model: mujoco.MjModel, joint: int, prim: Any) -> None:
 
 
 def add_drives(writer: attr.StageWriter) -> list[int]:
-    """Write the actuators that USD has drives for; return the others, which need prims of their own."""
+    """Write actuators as USD drives where possible; return the others, which need actuator prims."""
     model, joints, driven = writer.model, writer.joints, dict[int, int]()
     for actuator in range(model.nu):
         servo, joint = _servo(model, actuator), int(model.actuator_trnid[actuator, 0])
