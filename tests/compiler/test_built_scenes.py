@@ -145,7 +145,7 @@ def test_what_a_given_scene_cannot_do_is_said(tmp_path):
             DOCUMENT | {"robot": {"layout": LAYOUT, "collision": "primitive"}},
             spec,
             SpecError,
-            "colliders lie beside a robot's file",
+            "primitive colliders are read from the robot's folder",
         ),
         (DOCUMENT | {"objects": {"cube": {"body": "cub"}}}, spec, SpecError, 'no body is named "cub"; did you mean "cube"?'),
     ):

@@ -185,7 +185,7 @@ def test_a_scene_that_would_be_kept_otherwise_is_refused_by_the_name_of_the_fiel
         return compiled(scene, assets)
 
     monkeypatch.setattr("tgdsl.compiler.scene.compiled", otherwise)
-    with pytest.raises(RobotError, match=r"cannot be kept faithfully: in MuJoCo's model .*\b" + field + r"\b.* would differ"):
+    with pytest.raises(RobotError, match=r"cannot be saved faithfully: in MuJoCo's model .*\b" + field + r"\b.* would differ"):
         scene_file(rich, NOTHING)
 
 

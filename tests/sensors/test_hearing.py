@@ -103,7 +103,7 @@ def test_single_precision_hears_the_same_for_long(build):
         ({"hears": ["tone", "tone"]}, r'sensors\.mic\.hears\[1\]: sensor "tone" is listed twice'),
         (
             {"hears": ["mic"]},
-            r'sensors\.mic\.hears\[0\]: "mic" \(microphone\) makes no sound, as it is written; those that do: tone',
+            r'sensors\.mic\.hears\[0\]: "mic" \(microphone\) makes no sound, as it is written; sensors that do: tone',
         ),
         ({"levels": {"ton": 2.0}}, r'sensors\.mic\.levels: it does not hear "ton"; did you mean "tone"'),
         ({"body": "c"}, r'sensors\.mic\.body: the scene has no body "c"'),

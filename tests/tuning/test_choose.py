@@ -223,7 +223,7 @@ def place_of(document, text):
         (
             "touch: {kind: kinematic_taxel, accuracy: {force: 3 mN}}",
             "{force: 3 mN}",
-            "sensors.touch.accuracy: nothing is said of torque, which the reading has too; expected a bound of each quantity",
+            "sensors.touch.accuracy: the reading has torque too, without a bound; expected a bound of each quantity",
         ),
         (
             "touch: {kind: kinematic_taxel, outputs: [force], accuracy: {force: 1 %, torqe: 3 mN}}",

@@ -65,10 +65,10 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
     joined = passes.join(sensors)
     shared = passes.share(sensors, joined, resolved.layout, quantities)
     numbered = passes.number(pruned, resolved.objects, shared.uses, quantities)
-    asked = tuple(quantity for quantity in quantities if quantity.name in shared.uses)
-    parts = _quantity_parts(loaded, resolved, pruned, numbered, shared, asked, joints.joints, progress)
+    used = tuple(quantity for quantity in quantities if quantity.name in shared.uses)
+    parts = _quantity_parts(loaded, resolved, pruned, numbered, shared, used, joints.joints, progress)
     loaded.raise_problems()
-    planned = tuple(_sensor(sensor, joined, shared, parts, asked) for sensor in sensors)
+    planned = tuple(_sensor(sensor, joined, shared, parts, used) for sensor in sensors)
     terms = _observations(loaded, planned, {sensor.name: sensor.layout for sensor in sensors}, joints)
     loaded.raise_problems()
     unfelt = unfelt_taxels(resolved, sensors, pruned)
@@ -76,7 +76,7 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
     proprioception = _proprioception({term.type for term in terms}, joints, resolved.joints)
 
     read = {reading.name for reading in proprioception} | {"body_pos", "body_quat"}.union(
-        *(quantity.fields(parts[quantity.name]) for quantity in asked)
+        *(quantity.fields(parts[quantity.name]) for quantity in used)
     )
     varied = sorted((target for target in numbered.objects if target.varied >= 0), key=lambda target: target.varied)
     read |= {"variant"} if any(target.num_variants > 1 for target in varied) else set()
@@ -170,16 +170,16 @@ def _rows(loaded: Loaded, path: Path, spec: JointSpec, robot: RobotJoints) -> tu
 def _observations(
     loaded: Loaded, sensors: Sequence[PlannedSensor], layouts: Mapping[str, Layout], read: JointsRead
 ) -> tuple[PlannedObservation, ...]:
-    """Return the observation terms, in the document's order; what is wrong with one is noted."""
+    """Return the observation terms in the document's order; mistakes are noted."""
     reading_of = {reading.name: (reading, layouts[sensor.name]) for sensor in sensors for reading in sensor.readings}
     terms: list[PlannedObservation] = []
     for group, i, spec in _terms(loaded):
         if isinstance(spec, OfReading):
             terms += _of_reading(loaded, group, i, spec, reading_of)
         elif isinstance(spec, JointSpec):
-            chosen, every = read.terms[group, i], read.joints if PROPRIOCEPTION[spec.type].rows == "joint" else read.actuators
-            constants = {} if chosen == every else {"rows": np.array([every.index(n) for n in chosen], dtype=np.int64)}
-            terms.append(PlannedObservation(group, i, spec.type, spec.type, (0,), len(chosen), constants))
+            selected, every = read.terms[group, i], read.joints if PROPRIOCEPTION[spec.type].rows == "joint" else read.actuators
+            constants = {} if selected == every else {"rows": np.array([every.index(n) for n in selected], dtype=np.int64)}
+            terms.append(PlannedObservation(group, i, spec.type, spec.type, (0,), len(selected), constants))
         else:
             count = observations.HAND_ONLY.get(spec.type_name, 0)
             terms.append(PlannedObservation(group, i, spec.type_name, None, (), count, {}))
@@ -293,35 +293,35 @@ def _report_hopeless(loaded: Loaded, scene: Model, pruned: Pruned) -> None:
         loaded.note(path, problem, hint)
 
 
-Parts = dict[str, tuple[ContactPart, ...]]  # which geoms' contacts count, by name, where they are not just those of a body
+Parts = dict[str, tuple[ContactPart, ...]]  # by name, the geoms whose contacts count, unless they are one whole body's
 
 
 def _object_parts(loaded: Loaded, resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: Pruned) -> Parts:
-    """Return which geoms' contacts are an object's; what cannot be told apart is a mistake."""
+    """Return the geoms whose contacts are an object's; objects that share some of their geoms are a mistake."""
     objects = {}
     for name in sorted({pair.object for pair in pruned.contact_pairs}):
-        felt = resolved.objects[name]
+        sensed = resolved.objects[name]
         report = partial(loaded.note, ("objects", name, "surface"))
-        parts = contact_parts(resolved.scene, felt.bodies, felt.touched, report)
-        objects |= {name: parts} if parts != (ContactPart("body", felt.body),) else {}
+        parts = contact_parts(resolved.scene, sensed.bodies, sensed.touched, report)
+        objects |= {name: parts} if parts != (ContactPart("body", sensed.body),) else {}
     for name, request in ((s.sensor, r) for s in sensors for r in s.requests if r.wants_contacts):
         for (_, first), (i, second) in itertools.combinations(enumerate(request.objects), 2):
             one, two = resolved.objects[first].touched, resolved.objects[second].touched
             if one & two and not (one <= two or two <= one):
                 problem = f'"{second}" and "{first}" share some of their geoms, whose force would be counted twice'
                 path: Path = ("sensors", name, "feels", i)
-                loaded.note(path, problem, "give each a sensor of its own, or surfaces apart")
+                loaded.note(path, problem, "give each a separate sensor, or separate surfaces")
     return objects
 
 
 def _link_parts(loaded: Loaded, resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: Pruned) -> Parts:
-    """Return which geoms' contacts are a link's; what cannot be told apart is a mistake."""
+    """Return the geoms whose contacts are a link's; indistinguishable geoms are a mistake."""
     parts = {}
     for link in sorted({pair.link for pair in pruned.contact_pairs}):
         at: Path = ("sensors", next(sensor.sensor for sensor in sensors if link in sensor.layout.bodies), "links")
 
-        def report(what: str, hint: str, at: Path = at, link: str = link) -> None:
-            loaded.note(at, f'body "{link}" and what is welded to it: {what}', hint)
+        def report(problem: str, hint: str, at: Path = at, link: str = link) -> None:
+            loaded.note(at, f'body "{link}" and bodies welded to it: {problem}', hint)
 
         contact_geoms = link_parts(resolved.scene, resolved.link_bodies[link], report)
         parts |= {link: contact_geoms} if contact_geoms else {}
@@ -433,14 +433,14 @@ def _axis(rows: Axis) -> PlannedAxis:
 def _state(
     sensor: LoweredSensor, shared: Shared, parts: Mapping[str, Any], asked: Sequence[Quantity], shape: tuple[int, int]
 ) -> dict[str, PlannedMemory]:
-    """Return what a sensor carries from one call to the next; `shape` is that of its signal."""
+    """Return the memory that a sensor carries between calls; `shape`: its signal's shape."""
     memory = {}
-    for name, own in sensor.lowered.state.items():
-        rows = own.shape if isinstance(own.shape, tuple) else (sensor.rows.size,)
-        if isinstance(own.shape, type):
-            quantity = next(quantity for quantity in asked if quantity.request is own.shape)
+    for name, part in sensor.lowered.state.items():
+        rows = part.shape if isinstance(part.shape, tuple) else (sensor.rows.size,)
+        if isinstance(part.shape, type):
+            quantity = next(quantity for quantity in asked if quantity.request is part.shape)
             rows = (quantity.num_rows(parts[quantity.name], shared.of_sensor[sensor.name][quantity.name]),)
-        memory[name] = PlannedMemory(own.rest, rows, overwritten=own.overwritten)
+        memory[name] = PlannedMemory(part.rest, rows, overwritten=part.overwritten)
     if sensor.noise is not None:
         for name, past in sensor.noise.memory.items():
             memory[f"noise/{name}"] = PlannedMemory(0.0, shape, past)

@@ -162,12 +162,12 @@ def _knobs_of(loaded: Loaded, resolved: Resolved, name: str, layout: Layout, kin
         groups, selection = loaded.layout.spec.groups, Selection(include=(pattern,))
         in_line = not isinstance(written, str) and pattern in written.links
         missing: list[tuple[str, str]] = []
-        own, every = ([[link.name, link.body] for link in part.links] for part in (layout, resolved.layout))
-        select(selection, own if in_line else every, groups, lambda _, what, hint, found=missing: found.append((what, hint)))
+        local, every = ([[link.name, link.body] for link in part.links] for part in (layout, resolved.layout))
+        select(selection, local if in_line else every, groups, lambda _, text, hint, to=missing: to.append((text, hint)))
         for problem, hint in missing:
             path = ("sensors", name, "noise", "links", pattern) if in_line else ("sensors", name, "noise")
             loaded.note(path, problem if in_line else f'in the profile "{written}": {problem}', hint)
-        for i in select(selection, own, groups, lambda *_: None):
+        for i in select(selection, local, groups, lambda *_: None):
             of_links[i] = knobs.over(of_links[i])
     return of_links
 
@@ -209,7 +209,7 @@ def _imperfections(
         raise LowerError(problem, field="noise", hint="leave `links` of the noise out")
     which = of_link[rows.link_id] if rows.link_id is not None else np.zeros(rows.size, dtype=np.int64)
     if rows.name != "taxel" and any(knob.crosstalk is not None for knob in knobs):
-        problem = f"crosstalk mixes neighbouring taxels, and what this sensor reads is of a {rows.name} each"
+        problem = f"crosstalk mixes neighbouring taxels, and this sensor reads one value per {rows.name}"
         raise LowerError(problem, field="noise", hint="leave `crosstalk` out")
     channels = [channel.name for channel in lowered.signal or lowered.channels]
     noise = lower_noise([_without_idle(name, kind, knob) for knob in sets], which, channels, layout)
@@ -217,7 +217,7 @@ def _imperfections(
 
 
 def _without_idle(name: str, kind: Kind, knobs: Knobs) -> Knobs:
-    """Return knobs without those that change nothing in what the kind reads, of which a warning says so."""
+    """Return knobs without the ones that change nothing in the kind's readings; warn of them."""
     idle = [knob for knob in knobs.active() if knob in kind.idle_knobs]
     for knob in idle:
         warnings.warn(f'sensor "{name}": {knob} changes nothing in what {kind.name} reads', stacklevel=2)
@@ -225,7 +225,7 @@ def _without_idle(name: str, kind: Kind, knobs: Knobs) -> Knobs:
 
 
 def _fit_all(loaded: Loaded, sensors: Sequence[LoweredSensor], timestep: float) -> list[LoweredSensor]:
-    """Return sensors, each fitted to the scene's time step [s] and to those that it reads; mistakes are noted."""
+    """Return sensors fitted to the scene's time step [s] and to their upstream sensors; mistakes are noted."""
     reading = {sensor.name: _upstream_of(loaded, sensor, sensors) for sensor in sensors}
     loaded.raise_problems()
     done: dict[str, LoweredSensor] = {}
@@ -245,7 +245,7 @@ def _fit_all(loaded: Loaded, sensors: Sequence[LoweredSensor], timestep: float) 
 
 
 def _fitted(sensor: LoweredSensor, fitting: Fitting) -> LoweredSensor:
-    """Return a sensor, fitted to those that it reads."""
+    """Return a sensor fitted to its upstream sensors."""
     lowered = sensor.lowered
     if sensor.kind.fit is not None:
         lowered = sensor.kind.fit(sensor.spec, lowered, fitting)
@@ -259,7 +259,7 @@ def _fitted(sensor: LoweredSensor, fitting: Fitting) -> LoweredSensor:
 
 
 def _upstream_of(loaded: Loaded, sensor: LoweredSensor, sensors: Sequence[LoweredSensor]) -> tuple[str, ...]:
-    """Return the names of the sensors that one reads, the way without noise of each; what is wrong with them is noted."""
+    """Return the names of a sensor's upstream sensors, each without noise; mistakes are noted."""
     upstream = sensor.lowered.upstream
     if upstream is None:
         return ()
@@ -278,14 +278,14 @@ def _upstream_of(loaded: Loaded, sensor: LoweredSensor, sensors: Sequence[Lowere
             loaded.note(path, f'unknown sensor "{name}"', did_you_mean(name, kinds, "sensors"))
         elif name not in able:
             problem = f'"{name}" ({kinds[name]}) makes no {upstream.what}, as it is written'
-            loaded.note(path, problem, f"those that do: {', '.join(able) or 'none'}")
+            loaded.note(path, problem, f"sensors that do: {', '.join(able) or 'none'}")
         elif name in upstream.sensors[:i]:
             loaded.note(path, f'sensor "{name}" is listed twice', "name it once")
     return tuple(able[name].name for name in upstream.sensors if name in able)
 
 
 def _check_places(kind: Kind, lowered: Lowered, layout: Layout, spec: AnySensorSpec, resolved: Resolved) -> None:
-    """Refuse requests of objects that are not there, and rows that are not where they say."""
+    """Refuse requests of unknown objects, and rows that disagree with the layout."""
     for request in lowered.requests:
         if request.wants_contacts and not request.objects:
             raise TgdslError(f'kind "{kind.name}": {type(request).__name__} is asked of no objects, expected at least one')
@@ -306,7 +306,7 @@ def _check_places(kind: Kind, lowered: Lowered, layout: Layout, spec: AnySensorS
 
 
 def _check_accuracy(loaded: Loaded, name: str, lowered: Lowered) -> None:
-    """Note a sensor's `accuracy` that is not of what it reads."""
+    """Note an `accuracy` that does not match the sensor's quantities."""
     accuracy = loaded.spec.sensors[name].accuracy
     if accuracy is None:
         return
@@ -322,7 +322,7 @@ def _check_accuracy(loaded: Loaded, name: str, lowered: Lowered) -> None:
             loaded.note(path, f'"{bound.text}" is in {bound.unit}, and the reading has {quantities}', _hint(units))
     missing = [quantity for quantity in units if accuracy.of(quantity) is None]
     if missing:
-        loaded.note(at, f"nothing is said of {listed(missing)}, which the reading has too", "expected a bound of each quantity")
+        loaded.note(at, f"the reading has {listed(missing)} too, without a bound", "expected a bound of each quantity")
 
 
 def _hint(units: Mapping[str, str]) -> str:

@@ -1,7 +1,7 @@
 """The passes from lowered sensors to shared uses of quantities, each a function from values to a value.
 
-`prune` drops pairs that can never meet, `join` has sensors of one kind on different taxels computed as one, `share` lets all
-sensors that ask alike at the same taxels be one use, `number` gives objects and bodies their places.
+`prune` drops pairs that can never meet, `join` computes sensors of one kind on different taxels as one, `share` merges equal
+requests at the same taxels into one use, `number` assigns indices to objects and bodies.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ Joined = Mapping[str, tuple[LoweredSensor, ...]]  # the sensors that are compute
 
 
 class Pruned(NamedTuple):
-    """Which pairs there are."""
+    """The pairs of links and objects."""
 
     pairs: tuple[Pair, ...]  # the (link body, object) pairs that are needed, sorted by object and link
-    contact_pairs: tuple[Pair, ...]  # those of them whose contacts are needed
-    dropped: tuple[Pair, ...]  # those that can never be in contact
-    hopeless: tuple[tuple[str, str], ...]  # sensors that can never feel an object of theirs, and the object
+    contact_pairs: tuple[Pair, ...]  # the subset whose contacts are needed
+    dropped: tuple[Pair, ...]  # pairs that can never be in contact
+    hopeless: tuple[tuple[str, str], ...]  # (sensor, object) where the sensor can never touch the object
 
 
 def prune(sensors: Sensors, sensed: Mapping[str, SensedObject], link_bodies: LinkBodies, scene: Model) -> Pruned:
-    """Return the pairs that some request is of and that can meet."""
+    """Return the requested pairs that can meet."""
     geoms = {link: [geom.id for geom in scene.rigid_geoms(bodies) if geom.is_colliding] for link, bodies in link_bodies.items()}
     can_meet: set[Pair] = set()
     touching: set[Pair] = set()
@@ -43,12 +43,12 @@ def prune(sensors: Sensors, sensed: Mapping[str, SensedObject], link_bodies: Lin
     for sensor in sensors:
         for target in dict.fromkeys(name for request in sensor.requests for name in request.objects):
             requests = [request for request in sensor.requests if target in request.objects]
-            pairs, felt = {Pair(body, target) for body in sensor.layout.bodies}, sensed[target]
-            meeting = {p for p in pairs if scene.geoms_can_collide(geoms[p.link], felt.touched)}
+            pairs, surface = {Pair(body, target) for body in sensor.layout.bodies}, sensed[target]
+            meeting = {p for p in pairs if scene.geoms_can_collide(geoms[p.link], surface.touched)}
             is_gated = any(request.is_gated for request in requests)
             if is_gated or any(request.wants_contacts for request in requests):
                 touching |= meeting
-            itself = {p for p in pairs if scene.compiled.body(p.link).id in felt.bodies}
+            itself = {p for p in pairs if scene.compiled.body(p.link).id in surface.bodies}
             apart = pairs - meeting if is_gated else itself
             can_meet |= pairs - apart
             never |= apart
@@ -62,10 +62,10 @@ def _sorted(pairs: set[Pair]) -> tuple[Pair, ...]:
 
 
 def join(sensors: Sensors) -> Joined:
-    """Return which sensors are computed as one: those of one kind on different taxels, such as one on each finger.
+    """Return the sensors that are computed as one: sensors of one kind on different taxels, such as one on each finger.
 
-    Their parameters may differ. No probe is measured twice for it: of sensors that measure at the same taxels all are joined
-    with sensors on the same other taxels, or none is.
+    Their parameters may differ. No probe is measured twice: sensors that measure at the same taxels are all joined with
+    sensors on the same other taxels, or none of them is joined.
     """
     alike: dict[Hashable, list[LoweredSensor]] = {}
     for sensor in sensors:
@@ -89,7 +89,7 @@ def _is_measuring(sensor: LoweredSensor) -> bool:
 
 
 def _equation(sensor: LoweredSensor) -> Hashable | None:
-    """Return what sensors that can be computed as one have in common; None of one that never can."""
+    """Return the key that sensors share if they can be computed as one; None for a sensor that never can."""
     lowered, kind = sensor.lowered, sensor.kind
     has_own = lowered.state or lowered.reports or sensor.radius_noise or any(c.ndim for c in lowered.constants.values())
     is_coupled = lowered.provides or lowered.upstream or lowered.substeps
@@ -100,14 +100,14 @@ def _equation(sensor: LoweredSensor) -> Hashable | None:
 
 
 class Shared(NamedTuple):
-    """What is asked for."""
+    """The distinct requests of all sensors."""
 
     uses: dict[str, list[Use]]  # by quantity the distinct requests, in the order in which sensors make them
     of_sensor: dict[str, dict[str, int]]  # by sensor the number of its use of each quantity
 
 
 def share(sensors: Sensors, joined: Joined, layout: Layout, quantities: Sequence[Quantity]) -> Shared:
-    """Return the distinct uses of each quantity: all that ask alike at the same taxels are one."""
+    """Return the distinct uses of each quantity: equal requests at the same taxels are one use."""
     places: dict[bytes, np.ndarray] = {}
     result: dict[tuple[Hashable, ...], Use] = {}
     keys: dict[str, list[tuple[Hashable, ...]]] = {}
@@ -144,14 +144,14 @@ def _quantity_of(request: Request, quantities: Sequence[Quantity]) -> Quantity:
 
 
 def rows_of(sensor: LoweredSensor, joined: Joined) -> tuple[int, int]:
-    """Return which rows of its uses a sensor has: the first, and one beyond the last."""
+    """Return a sensor's rows in its uses: the first row, and one past the last."""
     group = joined.get(sensor.name, ())
     first_row = sum(len(other.taxels) for other in group[: group.index(sensor)]) if group else 0
     return first_row, first_row + (len(sensor.taxels) or sensor.rows.size)
 
 
 class Numbered(NamedTuple):
-    """What has a place in the Plan or the state: objects, the bodies whose poses are read, and the pairs of both."""
+    """Objects, bodies whose poses are read, and their pairs, in the order of the Plan and the state."""
 
     objects: tuple[PairedObject, ...]
     bodies: tuple[str, ...]
@@ -164,8 +164,8 @@ def number(
     """Return objects and bodies in their order, and the table of pairs."""
     names = sorted({pair.object for pair in pruned.pairs})
     body_of = {name: sensed[name].body for name in names}
-    besides = {body for q in quantities for use in uses.get(q.name, ()) for body in q.bodies(use)}
-    bodies = sorted({pair.link for pair in pruned.pairs} | set(body_of.values()) | besides)
+    extra = {body for q in quantities for use in uses.get(q.name, ()) for body in q.bodies(use)}
+    bodies = sorted({pair.link for pair in pruned.pairs} | set(body_of.values()) | extra)
     varied = [name for name in names if sensed[name].is_sized or len(sensed[name].variants) > 1]
     objects = []
     for name in names:

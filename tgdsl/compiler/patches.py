@@ -1,6 +1,6 @@
-"""What a document's names are on robot and scene: links with taxels, and the taxels on them; objects, rigid bodies, joints.
+"""Resolve a document's names on robot and scene: links with their taxels, objects, rigid bodies, joints.
 
-What is wrong with a name is noted at its place.
+Mistakes are noted at the place of the name.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ DrawnOn = dict[Hashable, Drawn]  # what placements on one surface share, by the 
 
 @dataclass(frozen=True)
 class Patch:
-    """A link that the layout gives taxels: its name and body, the geoms that are sampled, and how."""
+    """A link with taxels: its name and body, the sampled geoms, and their placement."""
 
     link: Link
     geoms: tuple[Geom, ...]
@@ -52,23 +52,23 @@ class Patch:
 
 
 def names_of(robot: Model) -> list[list[str]]:
-    """Return the names that selectors know: of bodies, geoms and meshes, each with those of what it belongs to."""
+    """Return the names that selectors match: each body's; each named geom's, with its mesh's and its body's."""
     return [[body] for body in robot.bodies] + [[*geom.names, geom.body] for geom in robot.geoms if geom.names]
 
 
 def reporter(owner: Loaded | LoadedLayout, path: Path, problems: list[Problem]) -> Report:
-    """Return a function that notes what is wrong with a pattern, at the place where the pattern stands.
+    """Return a function that notes mistakes of a pattern at the pattern's place.
 
-    That a pattern is the name of a group which was left out, as it has a mistake of its own, is no other mistake.
+    A pattern that names a group with a mistake is not reported again.
     """
     layout = owner.layout if isinstance(owner, Loaded) else owner
 
-    def report(where: tuple[str, int], what: str, hint: str) -> None:
+    def report(where: tuple[str, int], message: str, hint: str) -> None:
         written = owner.raw(path)  # `links: a` and `links: [a]` stand for `links: {include: [a]}`
         place = where if isinstance(written, dict) else where[1:] if isinstance(written, list) else ()
         pattern = owner.raw((*path, *place))
         if layout is None or pattern in layout.spec.groups or layout.raw(("groups", str(pattern))) is None:
-            problems.append(owner.problem((*path, *place), what, hint))
+            problems.append(owner.problem((*path, *place), message, hint))
 
     return report
 
@@ -186,12 +186,12 @@ def _groups(layout: LoadedLayout, patches: list[Patch]) -> dict[str, tuple[str, 
     candidates = [[patch.link.name, patch.link.body] for patch in patches]
     spec = layout.spec.groups
     members = {group: select(selection, candidates, spec, lambda *_: None) for group, selection in sorted(spec.items())}
-    return {group: tuple(patches[i].link.name for i in chosen) for group, chosen in members.items() if chosen}
+    return {group: tuple(patches[i].link.name for i in ids) for group, ids in members.items() if ids}
 
 
-ObjectReport = Callable[[str, str], None]  # called with what is wrong with an object, and a hint
+ObjectReport = Callable[[str, str], None]  # called with a mistake of an object, and a hint
 LEAST_VOLUME = 1e-9
-"""Volume over area^3/2 up to which it is rounding, as where faces of an open surface do not agree which side is out."""
+"""Volume over area^3/2 below which the volume is rounding, as of an open surface with inconsistent winding."""
 
 
 def sensed_object(
@@ -203,22 +203,22 @@ def sensed_object(
     others: Collection[str],
     report: ObjectReport,
 ) -> SensedObject:
-    """Return an object's geoms that count: the colliding, the visible, the named, or its own ones.
+    """Return an object with its sensed geoms: the colliding, the visible, the named, or the document's.
 
-    Bodies that are welded to its body from below are part of it, and the solver's contacts with it are those on its geoms that
-    collide. A surface that is only seen has none of its own: contacts with it are those of the whole object.
+    Bodies welded below its body are part of it. The solver's contacts with it are on its colliding geoms; for a surface that
+    is only visible, on the colliding geoms of the whole object.
     """
     bodies = scene.rigid_bodies(body, others)
     if target.compounds:
         touched = scene.touchable(body)
         models = [(model, tuple(geom for geom in model.geoms if geom.name in names)) for model, names in variants]
-        parts, felt = [geoms for _, geoms in models], [_felt(geoms, body, target, model, report) for model, geoms in models]
+        parts, felt = [geoms for _, geoms in models], [_sensed(geoms, body, target, model, report) for model, geoms in models]
     else:
         rigid_geoms = scene.rigid_geoms(bodies)
-        selected = _chosen(rigid_geoms, body, target, report)
+        selected = _selected(rigid_geoms, body, target, report)
         colliding = (tuple(geom for geom in geoms if geom.is_colliding) for geoms in (selected, rigid_geoms))
         touched = next(filter(None, colliding), ())
-        parts, felt = [rigid_geoms], [_felt(selected, body, target, scene, report)]
+        parts, felt = [rigid_geoms], [_sensed(selected, body, target, scene, report)]
     if target.size == "per_env":
         for geoms in parts:
             if len(geoms) != 1 or geoms[0].shape not in NUM_SIZES:
@@ -239,7 +239,7 @@ def sensed_object(
 
 
 def _heat(felt: Sequence[Sequence[SurfaceGeom]], body: str, target: ObjectSpec, report: ObjectReport) -> ObjectHeat | None:
-    """Return what the flow of heat needs to know of an object; None if the document gives it no material."""
+    """Return an object's thermal data; None if the document gives it no material."""
     if target.material is None or not all(felt):
         return None
     for geom in itertools.chain(*felt):
@@ -266,9 +266,9 @@ def _heat(felt: Sequence[Sequence[SurfaceGeom]], body: str, target: ObjectSpec, 
 
 
 def contact_parts(scene: Model, bodies: Sequence[int], touched: Set[int], report: ObjectReport) -> tuple[ContactPart, ...]:
-    """Return the geoms that contacts with an object or a link act on as MuJoCo's contact sensors can name them.
+    """Return the geoms of contacts with an object or a link, as parts that MuJoCo's contact sensors can name.
 
-    `bodies` are one rigid body, the first its own; `report` is called where a geom has no name that would tell it apart.
+    `bodies` are one rigid body, its own body first; `report` is called for a geom that needs a name and has none.
     """
     model, first = scene.compiled, bodies[0]
     body_geoms = {body: {g.id for g in scene.rigid_geoms((body,)) if g.is_colliding} for body in bodies}
@@ -284,46 +284,49 @@ def contact_parts(scene: Model, bodies: Sequence[int], touched: Set[int], report
             continue
         for geom in (geom for geom in scene.rigid_geoms((body,)) if geom.id in geoms & touched):
             if not geom.name:
-                problem = f"{geom.shown} has no name of its own, so the solver's contacts on it cannot be told from others"
+                problem = f"{geom.shown} has no name, so its contacts cannot be distinguished from others"
                 report(problem, "name it, or its body, in the scene")
             parts.append(ContactPart("geom", geom.name))
     return tuple(parts) or (ContactPart("body", model.body(first).name),)
 
 
-def _felt(geoms: Sequence[Geom], body: str, target: ObjectSpec, scene: Model, report: ObjectReport) -> tuple[SurfaceGeom, ...]:
-    felt = []
+def _sensed(
+    geoms: Sequence[Geom], body: str, target: ObjectSpec, scene: Model, report: ObjectReport
+) -> tuple[SurfaceGeom, ...]:
+    surfaces = []
     for geom in geoms:
         if geom.shape == "mesh":
             mesh = scene.mesh(geom)
-            felt.append(SurfaceGeom(geom, scene.hull(geom), mesh) if target.surface == "collision" else SurfaceGeom(geom, mesh))
+            is_hull = target.surface == "collision"
+            surfaces.append(SurfaceGeom(geom, scene.hull(geom), mesh) if is_hull else SurfaceGeom(geom, mesh))
         elif geom.shape in SHAPES:
-            felt.append(SurfaceGeom(geom, None))
+            surfaces.append(SurfaceGeom(geom, None))
         else:
-            problem = f'{geom.shown} of body "{body}" is of type {geom.shape}, which cannot be felt'
-            report(problem, f"types that can: {', '.join(SHAPES)}, mesh")
-    return tuple(felt)
+            problem = f'{geom.shown} of body "{body}" is of type {geom.shape}, which sensors do not support'
+            report(problem, f"supported types: {', '.join(SHAPES)}, mesh")
+    return tuple(surfaces)
 
 
-def _chosen(own: tuple[Geom, ...], body: str, target: ObjectSpec, report: ObjectReport) -> tuple[Geom, ...]:
-    if not own:
+def _selected(geoms: tuple[Geom, ...], body: str, target: ObjectSpec, report: ObjectReport) -> tuple[Geom, ...]:
+    if not geoms:
         report(f'body "{body}" has no geoms to feel', "")
     if target.surface == "collision":
-        return tuple(geom for geom in own if geom.is_colliding) or own
+        return tuple(geom for geom in geoms if geom.is_colliding) or geoms
     if target.surface == "visual":
-        return tuple(geom for geom in own if not geom.is_colliding) or own
-    named = tuple(geom for geom in own if any(matching(target.surface, [name]) for name in geom.names))
-    if own and not named:
-        names = sorted({name for geom in own for name in geom.names})
+        return tuple(geom for geom in geoms if not geom.is_colliding) or geoms
+    named = tuple(geom for geom in geoms if any(matching(target.surface, [name]) for name in geom.names))
+    if geoms and not named:
+        names = sorted({name for geom in geoms for name in geom.names})
         report(f'no geom or mesh of body "{body}" matches "{target.surface}"', f"it has {', '.join(names)}")
     return named
 
 
 LinkBodies = Mapping[str, tuple[int, ...]]
-"""Indices of the bodies that each link's body is one rigid body with, its own first, by its name."""
+"""By link, the indices of the bodies of its rigid body, the link's geoms body first."""
 
 
 def link_bodies(scene: Model, links: Collection[str], objects: Collection[str]) -> dict[str, tuple[int, ...]]:
-    """Return the bodies that each link's body is one rigid body with: see `Inputs.parts_of_link`.
+    """Return the bodies of each link's rigid body: see `Inputs.parts_of_link`.
 
     `links` carry taxels of the layout or are links of a sensor, `objects` are bodies of objects.
     """
@@ -332,9 +335,9 @@ def link_bodies(scene: Model, links: Collection[str], objects: Collection[str]) 
 
 
 def link_parts(scene: Model, bodies: tuple[int, ...], report: ObjectReport) -> tuple[ContactPart, ...]:
-    """Return the geoms that contacts with a link act on, nothing where no body but its own has geoms that collide.
+    """Return the geoms of contacts with a link; nothing if only the link's own body has colliding geoms.
 
-    `report` is called where a geom has no name that would tell it apart.
+    `report` is called for a geom that needs a name and has none.
     """
     colliding = [geom for geom in scene.rigid_geoms(bodies) if geom.is_colliding]
     if not any(scene.compiled.geom_bodyid[geom.id] != bodies[0] for geom in colliding):
@@ -343,7 +346,7 @@ def link_parts(scene: Model, bodies: tuple[int, ...], report: ObjectReport) -> t
 
 
 def joints_matching(loaded: Loaded, path: Path, pattern: str, own: RobotJoints) -> list[str]:
-    """Return the joints that a pattern matches, in their order; that there are none is noted."""
+    """Return the joints that a pattern matches, in the robot's order; a pattern without a match is noted."""
     hits = matching(pattern, [name for name in own.joints if name])
     if not hits:
         joint_names = [name for name in (*own.joints, *own.others) if name]
@@ -355,7 +358,7 @@ def joints_matching(loaded: Loaded, path: Path, pattern: str, own: RobotJoints) 
 
 
 def sensor_joints(loaded: Loaded, own: RobotJoints) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield each sensor that is on joints, and these; that there are none, or nameless ones, is noted."""
+    """Yield each sensor on joints with its joints; sensors without joints, and nameless joints, are noted."""
     for name, spec in loaded.spec.sensors.items():
         if not isinstance(spec, OnJointsSpec):
             continue

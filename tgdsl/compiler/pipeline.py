@@ -69,14 +69,14 @@ def compile_document(
     choice: Choice = UNCHOSEN,
     scene: Model | None = None,
 ) -> Compiled:
-    """Compile a document to its Plan, and return the values that the Plan follows from with it: see `tgdsl.compile`.
+    """Compile a document to its Plan, and return it with the loaded and resolved document: see `tgdsl.compile`.
 
-    `sensors` names those that are wanted (default: all); `choice` is for sensors with an `accuracy`; `scene` is taken in place
-    of the document's.
+    `sensors` names the sensors to compile (default: all); `choice` is for sensors with an `accuracy`; `scene` replaces the
+    document's.
 
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.
-        RobotError: If a robot or scene file cannot be read, or holds what is not supported.
+        RobotError: If a robot or scene file cannot be read, or uses unsupported features.
         TgdslError: If a sensor has an `accuracy` and nothing was chosen.
     """
     all_kinds, tell = known_kinds(kinds), progress or silent
@@ -98,7 +98,7 @@ def compile_document(
 
 
 class Placed(NamedTuple):
-    """Where a document puts taxels."""
+    """The taxels that a document places."""
 
     model: mujoco.MjModel  # the model of the scene, or of the robot if there is no scene
     layouts: dict[str, Layout]  # the layouts, by resolution
@@ -112,17 +112,17 @@ def placed(
     kinds: Sequence[Kind] = (),
     progress: Progress = silent,
 ) -> Placed:
-    """Return where a document puts taxels, at one resolution or more, without lowering sensors or baking objects.
+    """Return a document's taxels at one or more resolutions, without lowering sensors or baking objects.
 
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.
-        RobotError: If a robot or scene file cannot be read, or holds what is not supported.
+        RobotError: If a robot or scene file cannot be read, or uses unsupported features.
         TgdslError: If the layout has no such resolution.
     """
     all_overrides, all_kinds = overrides or {}, known_kinds(kinds)
     loaded = load(document, all_overrides, all_kinds, needs_sensors=False)
     if loaded.layout is None:
-        return Placed(resolve(loaded).scene.compiled, {}, {})  # which says all that is wrong, if a layout is needed
+        return Placed(resolve(loaded).scene.compiled, {}, {})  # raises all mistakes, if a layout is needed
     names, only = list(loaded.layout.spec.resolutions), loaded.resolution
     shown_names = list(resolutions) or ([only] if only is not None else names)
     for name in resolutions:

@@ -50,7 +50,7 @@ from tgdsl.surfaces.surface import Surface
 
 
 def own_objects(loaded: Loaded, scene: Model, links: Set[str]) -> tuple[Model, OwnObjects]:
-    """Return the scene with the bodies that the document adds, and the objects with geoms or sizes of their own.
+    """Return the scene with the document's new bodies, and the objects whose geoms or sizes the document sets.
 
     `links` are bodies that carry taxels.
     """
@@ -62,11 +62,11 @@ def own_objects(loaded: Loaded, scene: Model, links: Set[str]) -> tuple[Model, O
         if not (target.compounds or target.size == "per_env") or body not in scene.bodies:
             continue
 
-        def report(place: Path, what: str, hint: str = "", name: str = name) -> None:
-            loaded.note(("objects", name, *place), what, hint)
+        def report(place: Path, message: str, hint: str = "", name: str = name) -> None:
+            loaded.note(("objects", name, *place), message, hint)
 
         same_body = [other for other, part in body_of.items() if part == body and other != name]
-        rigid = [scene.compiled.body(i).name for i in scene.rigid_bodies(body, _others(loaded, body))]
+        rigid = [scene.compiled.body(i).name for i in scene.rigid_bodies(body, _other_bodies(loaded, body))]
         if carrying := [part for part in rigid if part in links]:
             report(("body",), f'body "{carrying[0]}" carries taxels, so its geoms cannot be others')
         elif same_body:
@@ -75,11 +75,11 @@ def own_objects(loaded: Loaded, scene: Model, links: Set[str]) -> tuple[Model, O
             report(("body",), f'body "{body}" has no geom', "its first geom says what `geom` does not, such as friction")
         else:
             new_body = scene_object(name, target, loaded.folder, meshes, report)
-            objects.append(replace(new_body, others=tuple(sorted(_others(loaded, body)))))
+            objects.append(replace(new_body, others=tuple(sorted(_other_bodies(loaded, body)))))
     return scene, OwnObjects(bodies, tuple(objects), meshes)
 
 
-def _others(loaded: Loaded, body: str) -> set[str]:
+def _other_bodies(loaded: Loaded, body: str) -> set[str]:
     return {target.body_of(name) for name, target in loaded.spec.objects.items()} - {body}
 
 
@@ -94,14 +94,14 @@ def _new_bodies(loaded: Loaded, scene: Model) -> tuple[NewBody, ...]:
             loaded.note(("objects", name), problem, f"`body: {name}` gives that one these geoms")
         elif target.body is None:
             pos, quat = target.pos or (0.0, 0.0, 0.0), target.quat or (1.0, 0.0, 0.0, 0.0)
-            own, default = (target.contype, target.conaffinity), bits_that_meet(scene.spec.geoms)
-            bits = [bit if given is None else given for given, bit in zip(own, default, strict=True)]
+            written, default = (target.contype, target.conaffinity), bits_that_meet(scene.spec.geoms)
+            bits = [bit if mask is None else mask for mask, bit in zip(written, default, strict=True)]
             new.append(NewBody(name, pos, quat, target.joint != "fixed", group, *bits))
     return tuple(new)
 
 
 def sensed_objects(loaded: Loaded, scene: Model, own: OwnObjects) -> dict[str, SensedObject]:
-    """Return the objects that some sensor feels."""
+    """Return the objects that some sensor senses."""
     felt = {name for sensor in loaded.spec.sensors.values() for name in sensor.objects}
     with_geoms = {target.name: target for target in own.objects if target.types}
     is_faulty = bool(loaded.problems)
@@ -113,14 +113,14 @@ def sensed_objects(loaded: Loaded, scene: Model, own: OwnObjects) -> dict[str, S
             loaded.note(path, f'no body is named "{body}"', did_you_mean(body, scene.bodies, "bodies"))
         elif not (is_faulty and (target.compounds or target.size == "per_env")):  # else its mistakes are known already
             variants = variant_scenes(scene, with_geoms[name], own.meshes.contents) if target.compounds else []
-            sensed = sensed_object(name, body, target, scene, variants, _others(loaded, body), partial(loaded.note, path))
+            sensed = sensed_object(name, body, target, scene, variants, _other_bodies(loaded, body), partial(loaded.note, path))
             objects |= {name: sensed} if name in felt else {}
     return objects
 
 
 @dataclass(frozen=True, eq=False)
 class Models:
-    """What a document's files hold, at whatever resolution."""
+    """The models of a document's files, for all resolutions."""
 
     robot: Model | None  # the robot; None if a mistake of the document says why there is none
     scene: Model | None  # the model that holds robot and objects, or None
@@ -128,7 +128,7 @@ class Models:
 
     @cached_property
     def colliders(self) -> Colliders:
-        """What the simulator collides of the robot."""
+        """The robot's collision geometry."""
         assert self.robot is not None
         return Colliders(self.robot)
 
@@ -139,20 +139,20 @@ class Resolved:
 
     layout: Layout  # taxels of the links that some sensor has; of all links if the document has no sensors
     links: dict[str, tuple[str, ...]]  # names of each sensor's links
-    objects: dict[str, SensedObject]  # the geoms of each object that count
-    own: OwnObjects  # the objects with geoms or sizes of their own
+    objects: dict[str, SensedObject]  # the sensed geoms of each object
+    own: OwnObjects  # the objects whose geoms or sizes the document sets
     scene: Model  # the model that holds robot and objects
     robot: Model  # the robot's own model
     unused: tuple[tuple[str, str], ...]  # links and objects that are not needed, and why
     patches: Mapping[str, Patch]  # the links that carry taxels
-    colliders: Colliders  # what the simulator collides of the robot
-    reach: Reach  # what that leaves of each taxel
-    on_links: frozenset[str]  # the sensors that have a place on each link, whatever its taxels
+    colliders: Colliders  # the robot's collision geometry
+    reach: Reach  # which taxels the collision geometry leaves exposed
+    on_links: frozenset[str]  # the sensors with one place per link, whatever its taxels
     link_bodies: LinkBodies  # the bodies of each link that carries taxels or is a sensor's
     joints: RobotJoints  # the robot's joints and actuators
     on_joints: Mapping[str, tuple[str, ...]]  # names of the joints of each sensor that is on joints
-    primitives: tuple[Collider, ...] = ()  # collision shapes of links, instead of their own geoms
-    layouts: dict[str, Layout] = field(default_factory=dict)  # taxels of all links at other resolutions that were asked for
+    primitives: tuple[Collider, ...] = ()  # collision shapes that replace the links' geoms
+    layouts: dict[str, Layout] = field(default_factory=dict)  # taxels of all links at the other requested resolutions
 
     def surface_of(self, link: str, region: Sequence[RegionPart]) -> Surface:
         """Return the triangles of a link, or of a region of it, in its body's frame."""
@@ -305,26 +305,26 @@ def models_of(loaded: Loaded, given: Model | None = None) -> Models:
     if given is None:
         return Models(robot, scene)
     for key, model in {"robot": robot, "scene": scene if scene is not robot else None}.items():
-        if model is not None and model is not given and (found := list(differences(model, given))):
-            problem = f"this model is not the one in the given scene: {listed(found, 4)}"
-            loaded.note((key, "model"), problem, "without `model`, names are those of the scene")
+        if model is not None and model is not given and (differing := list(differences(model, given))):
+            problem = f"this model is not the one in the given scene: {listed(differing, 4)}"
+            loaded.note((key, "model"), problem, "without `model`, names are the scene's")
     return Models(robot, given)
 
 
 def _primitives(loaded: Loaded, scene: Model) -> tuple[Collider, ...]:
-    """Return the primitive colliders that the document asks for: those of a file beside the robot's."""
+    """Return the primitive colliders that the document requests, from the file next to the robot's."""
     robot, note = loaded.spec.robot, partial(loaded.note, ("robot", "collision"))
     if robot.collision != "primitive":
         return ()
     if robot.model == GIVEN:
-        problem = "colliders lie beside a robot's file, and this document names none"
+        problem = "primitive colliders are read from the robot's folder, and this document names no robot file"
         note(problem, "expected `collision: mesh`, or `robot: {model: …}`")
     if loaded.robot_file is None:
         return ()
     file = colliders_file(loaded.robot_file)
     if file is None:
-        beside = loaded.robot_file.with_name("colliders.yaml")
-        problem = f'"{robot.model}" has no primitive colliders: there is no file {beside}'
+        expected = loaded.robot_file.with_name("colliders.yaml")
+        problem = f'"{robot.model}" has no primitive colliders: there is no file {expected}'
         note(problem, "expected `collision: mesh`, or such a file")
         return ()
     try:

@@ -1,4 +1,4 @@
-"""The instrumented scene: contact sensors for the pairs that a module reads, objects with geoms of their own, its text."""
+"""The instrumented scene as text: contact sensors for a module's pairs, and objects whose geoms the document sets."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from tgdsl.scene.scene import Choice, compiled, geom_name, placeholder_name, por
 from tgdsl.schema.objects import MeshGeom, ObjectSpec, PrimitiveGeom
 
 SLOT_DATA = ("found", "force", "torque", "pos", "normal", "tangent")
-"""What a contact sensor hands out of each contact, in MuJoCo's order."""
+"""The data of a contact sensor per contact, in MuJoCo's order."""
 SENSED = ("found", "force", "torque", "dist", "pos", "normal", "tangent")  # the same and the distance, in MuJoCo's order
 MIXED_NUM = 64
-"""Contacts that a sensor shows where geoms have gaps and different margins: the nearest need not be those that carry force."""
+"""Contacts per sensor if geoms have gaps and different margins: the nearest contacts may then carry no force."""
 OBJECT_TYPES = {"body": mujoco.mjtObj.mjOBJ_BODY, "subtree": mujoco.mjtObj.mjOBJ_XBODY, "geom": mujoco.mjtObj.mjOBJ_GEOM}
-"""MuJoCo's types of what a part of an object or link is."""
+"""MuJoCo's object types of contact parts."""
 REDUCTIONS = ("none", "mindist", "maxforce", "netforce")  # MuJoCo's ways to reduce contacts, in the order of its numbers
 ASSET_TAGS = ("mesh", "texture", "hfield", "skin")  # elements of an MJCF file's `<asset>` that name a file
 FILE_ATTRIBUTES = ("file", *(f"file{side}" for side in ("right", "left", "up", "down", "front", "back")))
@@ -120,10 +120,10 @@ def _geoms(spec: mujoco.MjSpec, part: ContactPart) -> list[mujoco.MjsGeom]:
 
 
 def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None, colliders: tuple[Collider, ...] = ()) -> SceneFile:
-    """Return a scene with the contact sensors that a module wants, as text, and the objects that have geoms of their own.
+    """Return a scene as text, with a module's contact sensors, and the objects whose geoms the document sets.
 
-    The text is that of the scene's own files, to the letter but for file names: files and assets are named by content, so
-    the scene does not depend on where they lie. It is compiled again and compared, so that nothing goes missing unnoticed.
+    The text is copied from the scene's files; only file names change. Files and assets are named by content, so the scene
+    does not depend on their folders. The copy is compiled and compared with the original, so that no loss goes unnoticed.
     """
     own = OwnObjects() if own is None else own
     files = Files(dict(own.meshes.assets), dict(own.meshes.contents))
@@ -151,7 +151,7 @@ def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None, coll
     try:
         again = compiled(scene, files.contents)
     except ValueError as error:
-        raise RobotError(f"{model.file}: MuJoCo cannot read what is kept of this scene: {error}") from error
+        raise RobotError(f"{model.file}: MuJoCo cannot read the saved copy of this scene: {error}") from error
     _compare(model, inputs, again)
     return scene
 
@@ -193,14 +193,14 @@ class _Kept:
             if element.tag == "key" and element.get("qpos"):
                 element.set("qpos", element.get("qpos", "") + self.qpos)
             if element.tag in ("include", "model") and name:
-                element.set("file", self._part(_found(name, [""], folders, file), folders, element.tag, settings))
+                element.set("file", self._part(_resolved_path(name, [""], folders, file), folders, element.tag, settings))
             elif element.tag in ASSET_TAGS:
                 if name:
                     element.set("name", element.get("name", Path(name).stem))
                 subdirs = [settings.get(subfolders[element.tag], settings.get("assetdir", "")), ""]
                 for attribute in FILE_ATTRIBUTES:
                     if element.get(attribute):
-                        element.set(attribute, self._asset(_found(element.get(attribute, ""), subdirs, folders, file)))
+                        element.set(attribute, self._asset(_resolved_path(element.get(attribute, ""), subdirs, folders, file)))
         return root
 
     def _part(self, path: Path, folders: list[Path], tag: str, settings: dict[str, str]) -> str:
@@ -228,12 +228,12 @@ def _folder_settings(root: ET.Element, file: Path, folders: list[Path]) -> dict[
         if element.tag == "compiler":
             settings |= {name: value for name, value in element.attrib.items() if name in FOLDER_ATTRIBUTES}
         elif element.tag == "include" and (name := element.get("file")):
-            path = _found(name, [""], folders, file)
+            path = _resolved_path(name, [""], folders, file)
             settings |= _folder_settings(ET.parse(path).getroot(), path, [*folders, path.parent])
     return settings
 
 
-def _found(name: str, subfolders: list[str], folders: list[Path], file: Path) -> Path:
+def _resolved_path(name: str, subfolders: list[str], folders: list[Path], file: Path) -> Path:
     for folder in folders:
         for subfolder in subfolders:
             if (path := folder / subfolder / name).is_file():
@@ -242,32 +242,32 @@ def _found(name: str, subfolders: list[str], folders: list[Path], file: Path) ->
 
 
 def _compare(model: Model, inputs: Inputs, again: mujoco.MjModel) -> None:
-    """Refuse a kept scene that is not the loaded one with the contact sensors that are wanted."""
+    """Refuse a saved scene that differs from the loaded one with its contact sensors."""
     with muted_mujoco():
         loaded = instrument(model.spec.copy(), inputs).compile()
     if names := differing_fields(loaded, again, model.is_rounded):
-        raise RobotError(f"{model.file}: this scene cannot be kept faithfully: in MuJoCo's model {listed(names)} would differ")
+        raise RobotError(f"{model.file}: this scene cannot be saved faithfully: in MuJoCo's model {listed(names)} would differ")
 
 
 Report = Callable[[tuple[str | int, ...], str, str], None]
-"""Called with the place of a mistake below the object, what it is, and a hint."""
+"""Called with the mistake's place below the object, a message, and a hint."""
 
 
 @dataclass(frozen=True)
 class NewBody:
-    """A body that the scene is given."""
+    """A body that the document adds to the scene."""
 
     name: str
-    pos: tuple[float, float, float]  # where it starts, in the world [m]
-    quat: tuple[float, float, float, float]  # how it is turned there, w, x, y, z
+    pos: tuple[float, float, float]  # initial position in the world [m]
+    quat: tuple[float, float, float, float]  # initial orientation, w, x, y, z
     is_free: bool  # whether it moves freely, or is fixed to the world
-    group: int = 0  # of its geoms: one that weighs, where the scene's compiler takes all inertias from geoms
+    group: int = 0  # its geoms' group: one that counts if the scene's compiler infers all inertias from geoms
     contype: int = 1  # MuJoCo's bits of its geoms
     conaffinity: int = 1
 
     @property
     def geom(self) -> dict[str, tuple[Any, ...]]:
-        """Fields of its placeholder, which its geoms inherit: MuJoCo's own values, not those of the scene's `<default>`."""
+        """Fields of its placeholder, which its geoms inherit: MuJoCo's defaults, not the scene's `<default>`."""
         return PLAIN | {"contype": (self.contype,), "conaffinity": (self.conaffinity,), "group": (self.group,)}
 
 
@@ -284,13 +284,13 @@ PLAIN: dict[str, tuple[float, ...]] = {
     "gap": (0,),
     "rgba": (0.5, 0.5, 0.5, 1),
 }
-"""MuJoCo's own contact parameters: those of a scene's `<default>` are for the scene's geoms."""
+"""MuJoCo's default contact parameters: a scene's `<default>` applies to the scene's geoms only."""
 INERTIAL = {"pos": (0.0, 0.0, 0.0), "mass": (1.0,), "diaginertia": (1.0, 1.0, 1.0)}
-"""Of a body until it has its own geoms, so that it compiles whatever the scene's compiler makes of inertias."""
+"""A body's inertia until it has geoms: it then compiles with any inertia settings of the scene's compiler."""
 
 
 def with_bodies(scene: Model, bodies: Sequence[NewBody]) -> Model:
-    """Return a scene with new bodies after all of its own; in its keyframes they are where they start."""
+    """Return a scene with new bodies after its own; its keyframes have them at their initial poses."""
     if not bodies:
         return scene
     spec = scene.spec.copy()
@@ -314,7 +314,7 @@ def with_bodies(scene: Model, bodies: Sequence[NewBody]) -> Model:
 
 
 def start_qpos(bodies: Sequence[NewBody]) -> list[float]:
-    """Return what new bodies add to `qpos` where they start."""
+    """Return the initial `qpos` of new bodies."""
     return [value for new in bodies if new.is_free for value in (*new.pos, *new.quat)]
 
 
@@ -335,7 +335,7 @@ def as_worldbody(bodies: Sequence[NewBody]) -> ET.Element:
 
 @dataclass
 class OwnObjects:
-    """Objects with geoms or sizes of their own: the new bodies among them, what they are like, and their mesh files."""
+    """Objects whose geoms or sizes the document sets, the new bodies among them, and their mesh files."""
 
     bodies: tuple[NewBody, ...] = ()
     objects: tuple[SceneObject, ...] = ()

@@ -166,7 +166,7 @@ def test_geoms_that_cannot_be_named_are_asked_for_names(tmp_path):
     np.testing.assert_allclose(touch(sim.state())["s"][0, 0], force, rtol=0, atol=1e-9)
     bare = hand(more=HINGED, **UNNAMED).replace('name="nail" type', "type")
     with pytest.raises(
-        SpecError, match=r'sensors\.s\.links: body "finger" and what is welded to it: unnamed sphere geom'
+        SpecError, match=r'sensors\.s\.links: body "finger" and bodies welded to it: unnamed sphere geom'
     ) as error:
         gripped(tmp_path, bare, sensors=sensors)
     assert "name it, or its body, in the scene" in str(error.value)

@@ -122,7 +122,7 @@ def test_a_geom_without_a_name_is_asked_for_one(tmp_path):
     asset = '<asset><mesh name="block" vertex="-1 -1 -1 1 -1 -1 -1 1 -1 -1 -1 1 1 1 1" scale=".02 .02 .02"/></asset>'
     body = TWO_GEOMS.replace('name="low" type="box" size=".02 .02 .02"', 'type="mesh" mesh="block"')
     objects = {"item": {"body": "item", "surface": "block"}}
-    with pytest.raises(SpecError, match=r'objects\.item\.surface: geom "block" has no name of its own') as error:
+    with pytest.raises(SpecError, match=r'objects\.item\.surface: geom "block" has no name') as error:
         compiled(tmp_path, body, objects, of_kinds(["item"]), extra=asset)
     assert "name it, or its body, in the scene" in str(error.value)
     alone = body.replace('name="high"', 'contype="0" conaffinity="0" name="high"')
