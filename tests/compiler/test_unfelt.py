@@ -82,7 +82,7 @@ def test_contacts_that_can_never_be(tmp_path, change):
     """An excluded pair, and masks that do not meet: the finger collides, but never with what its sensor feels by contact."""
     _, old, new = change
     text = hand().replace(old, new)
-    why = "finger: 1 of 1 taxels on a body that is never in contact with what their sensor feels, by contact alone"
+    why = "finger: 1 of 1 taxels on a body that is never in contact with its sensor's objects, which it reads by contact alone"
     assert told(document(tmp_path, {"a": {**DEPTH, "links": ["finger", "palm"]}}, text))[1] == [BURIED, INSIDE, why]
     # Nothing keeps the cube out of the finger then, so what is inside it feels by distance.
     inner = {"finger": [[0.02, 0, 0]], "palm": [[0, 0.025, 0.03]]}

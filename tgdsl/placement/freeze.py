@@ -18,8 +18,8 @@ from tgdsl.placement.sample.sample import CELL, REQUIRED, TANGENT
 from tgdsl.schema.placement import LayoutSpec
 
 _HEADER = """\
-# The taxels of {origin}, written down by `tgdsl layout freeze`: rows stay as they are, whatever becomes of robot and sampling.
-# The tables beside this file hold one taxel in a row, in the link's body frame, in metres; do not reorder them.
+# The taxels of {origin}, written by `tgdsl layout freeze`: they no longer depend on the robot's meshes or on sampling.
+# The tables next to this file hold one taxel per row, in the link's body frame, in metres; do not reorder the rows.
 """
 _COLUMNS = ("link", *CELL, *REQUIRED, *TANGENT, "radius", "area")
 

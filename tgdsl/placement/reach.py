@@ -1,7 +1,7 @@
-"""Which taxels nothing can touch: not collided by the simulator, buried in their own link, or covered by another at rest.
+"""Taxels that nothing can touch: not collided by the simulator, buried in their link, or covered by another link.
 
-MuJoCo collides convex solids: primitives, and the convex hulls of meshes. A taxel on a concave mesh may lie so deep inside its
-own link's hull that no object comes within its radius. All is in the model's initial state.
+MuJoCo collides convex solids: primitives, and the convex hulls of meshes. A taxel on a concave mesh may be so deep inside its
+link's hull that no object comes within its radius. Everything is evaluated in the model's initial state.
 
 Shapes: `taxel` taxels of a layout, `n` points of one body, `solid` colliding geoms.
 """
@@ -23,9 +23,9 @@ from tgdsl.surfaces.rays import sphere_directions
 from tgdsl.surfaces.region import Covered
 
 INSIDE = 1e-6  # depth from which a point counts as inside a solid [m]: links that touch face to face overlap by rounding
-DIRECTIONS = 100  # directions in which it is looked whether a ball reaches out of several solids together
-FEW_DIRECTIONS = (4, 20)  # most balls reach out in one of the first few: the rest is looked at for what is left
-NEVER_MET = "on a body that is never in contact with what their sensor feels, by contact alone"
+DIRECTIONS = 100  # directions in which a ball is tested for reaching out of several solids together
+FEW_DIRECTIONS = (4, 20)  # most balls reach out in one of the first few directions: the rest are tested for the other balls
+NEVER_MET = "on a body that is never in contact with its sensor's objects, which it reads by contact alone"
 _UNBOUNDED = ("plane", "hfield", "sdf", "unknown")
 """Types of geoms that are no convex solid: the ground, and shapes that MuJoCo collides otherwise."""
 
@@ -67,15 +67,15 @@ class Colliders:
     def solids_of(self, body: int) -> Int[np.ndarray, " solid"]:
         return np.flatnonzero(self.segment[self.body] == self.segment[body])
 
-    def others(self, body: int, ignored: Collection[int] = ()) -> Int[np.ndarray, " other"]:
-        """Return the solids of other links; bodies that float by themselves are objects, and the world is no link."""
+    def solids_of_others(self, body: int, ignored: Collection[int] = ()) -> Int[np.ndarray, " other"]:
+        """Return the solids of other links; separate free bodies are objects, and the world is no link."""
         is_near = (self.robot.compiled.body_rootid == self.robot.compiled.body_rootid[body]) | ~self.is_loose
         is_link = is_near & (self.segment != self.segment[body])
         is_link[[0, *ignored]] = False
         return np.flatnonzero(is_link[self.body])
 
     def depths(self, solids: Int[np.ndarray, " solid"], pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "solid n"]:
-        """Return how deep points of the world are inside each of some solids [m], see `ConvexSolid.depth`."""
+        """Return the depth of world points inside each solid [m], see `ConvexSolid.depth`."""
         results = [self.solids[i].depth(pos) for i in solids]
         return np.stack(results) if results else np.zeros((0, len(pos)))
 
@@ -107,7 +107,7 @@ class Colliders:
     def cover_of(self, body: str, geoms: Sequence[Geom], ignored: Collection[int] = ()) -> Covered:
         """Return a function that says which points of a body's frame are inside other colliding geoms of any link."""
         body_id = int(self.robot.compiled.body(body).id)
-        solids = np.concatenate([self.solids_of(body_id), self.others(body_id, ignored)])
+        solids = np.concatenate([self.solids_of(body_id), self.solids_of_others(body_id, ignored)])
         solids = solids[~np.isin(self.geom[solids], [geom.id for geom in geoms])]
 
         def is_covered(pos: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
@@ -131,7 +131,7 @@ class Colliders:
 
 
 def reach(colliders: Colliders, layout: Layout, ignored: Collection[int] = ()) -> Reach:
-    """Return what the colliding geoms of a robot leave of each taxel; inactive fillers (radius 0) are left as they are."""
+    """Return which taxels the robot's colliding geoms bury or cover; inactive fillers (radius 0) count as reachable."""
     count, model = layout.num_taxels, colliders.robot.compiled
     result = Reach(np.ones(count, bool), np.full(count, -np.inf), np.zeros(count, bool), np.full(count, -1))
     for place, name in enumerate(layout.bodies):
@@ -139,17 +139,17 @@ def reach(colliders: Colliders, layout: Layout, ignored: Collection[int] = ()) -
         body, pos = int(model.body(name).id), layout.pos[taxels]
         result.is_collided[taxels] = colliders.collides(body)
         result.is_buried[taxels], result.depth[taxels] = colliders.is_buried(body, pos, layout.radius[taxels])
-        others = colliders.others(body, ignored)
-        depths = colliders.depths(others, colliders.in_world(body, pos))
-        if len(others):
+        solids = colliders.solids_of_others(body, ignored)
+        depths = colliders.depths(solids, colliders.in_world(body, pos))
+        if len(solids):
             deepest = depths.argmax(axis=0)
             is_inside = depths.max(axis=0) > INSIDE
-            result.cover[taxels] = np.where(is_inside, colliders.body[others[deepest]], -1)
+            result.cover[taxels] = np.where(is_inside, colliders.body[solids[deepest]], -1)
     return result
 
 
 def unfelt(colliders: Colliders, layout: Layout, reached: Reach) -> tuple[Unfelt, ...]:
-    """Return the taxels that cannot feel by link and reason; each taxel is in one record."""
+    """Return the unreachable taxels by link and reason; each taxel is in one record."""
     records: list[Unfelt] = []
     is_buried = reached.is_collided & reached.is_buried
     is_covered = reached.is_collided & ~reached.is_buried & (reached.cover >= 0)

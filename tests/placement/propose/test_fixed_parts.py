@@ -10,7 +10,7 @@ from tgdsl.placement.propose.propose import Proposal, propose
 from tgdsl.placement.propose.text import layout_text
 
 DENSITY = 1e4
-HIDDEN = "behind what is fixed in front of it; --include adds it"
+HIDDEN = "behind bodies fixed in front of it; --include adds it"
 
 
 def proposal_of(tmp_path, text: str, density: float = DENSITY) -> Proposal:

@@ -281,7 +281,7 @@ def test_fingers_without_limits_close_where_their_tips_meet(tmp_path, limits):
     robot = loaded(tmp_path, single_links(limits))
     proposal = propose(robot, DENSITY)
     assert {link.name: link.facing for link in proposal.links} == {"palm": (0, 0, 1), "a": INNER, "b": INNER, "c": INNER}
-    doubt = "no joint of the hand has limits: its hinges are taken to turn by 30 deg to either side"
+    doubt = "no joint of the hand has limits: its hinges are assumed to turn by 30 deg to either side"
     assert {link.doubt for link in proposal.links if link.name != "palm"} == {doubt}
     assert closing_motion(robot) == {}
 

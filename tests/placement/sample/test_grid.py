@@ -131,7 +131,7 @@ def test_the_first_hit_is_never_on_an_inner_shell():
     found = sample(surface, placement("grid", rows=9, columns=9, direction=DOWN), HERE)
     assert np.linalg.norm(found.pos, axis=1).min() > 0.0099
     hidden = placement("grid", rows=9, columns=9, direction=DOWN, region={"geoms": "g0"})
-    assert str(error_of(surface, hidden)) == "no part of the region is seen along [0, 0, -1]; turn `direction`"
+    assert str(error_of(surface, hidden)) == "no part of the region is visible along [0, 0, -1]; turn `direction`"
 
 
 @pytest.mark.parametrize("cuts", [0, 1, 3])
@@ -198,4 +198,4 @@ def test_grid_errors_say_what_to_change():
         "is [0, 0, 1] meant? Else give more `rows` and `columns`"
     )
     up = placement("grid", rows=1, columns=1, direction=DOWN, region={"facing": [0, 0, -1], "within": "80 deg"})
-    assert str(error_of(surface, up)) == "no part of the region is seen along [0, 0, -1]; turn `direction`"
+    assert str(error_of(surface, up)) == "no part of the region is visible along [0, 0, -1]; turn `direction`"

@@ -100,7 +100,7 @@ def test_a_file_of_several_links_with_tangents_and_cells(tmp_path):
         (f"{HEADER},row,column\n0,0,0,0,0,1,1,.5\n", 'p.csv:2: column is ".5", expected a whole number from 0 to 999999'),
         (
             f"{HEADER},row,column\n0,0,0,0,0,1,1,2\n0,0,0,0,0,1,1,2\n",
-            "p.csv:3: row 1, column 2 is that of p.csv:2 too; one point for each cell",
+            "p.csv:3: row 1, column 2 is used by p.csv:2 too; one point for each cell",
         ),
         (f"{HEADER},x\n0,0,0,0,0,1,1\n", 'p.csv:1: column "x" is there twice'),
     ],

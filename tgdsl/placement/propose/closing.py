@@ -1,15 +1,15 @@
-"""Which end of each joint's range closes a hand, and what speaks against it.
+"""Which end of each joint's range closes a hand, and the evidence against it.
 
 The evidence, in the order in which it decides:
 
 1. A finger curls: a hinge whose range bends away from its start, in the sense of rotation of another hinge of its finger that
-   bends too, closes at the far end. That a tip then moves away from the others, as a thumb's may, is named but does not count:
-   what is nearer depends on the pose of the rest of the hand, how a finger curls does not. A joint that drives all fingers
-   closes where the tips draw nearer: fingers may be curled at the start.
-2. The tips draw nearer: any other joint closes at the end at which the tips that it moves are clearly nearer to those of the
-   other chains and to the palm, with the other joints half closed and closed; a slide, and the only hinge of a chain, even
-   against its range. A hinge of a curling finger that has its range against it stays undecided.
-   The jaw that turns against a fixed one closes at the end at which it is beside that, see `jaws`.
+   bends too, closes at the far end. A tip that then moves away from the others, as a thumb's may, is reported but does not
+   count: distances depend on the pose of the rest of the hand, the curl of a finger does not. A joint that drives all fingers
+   closes where the tips approach each other: fingers may be curled at the start.
+2. The tips approach: any other joint closes at the end at which its tips are clearly nearer to the other chains' tips and to
+   the palm, with the other joints half closed and closed; a slide, and the only hinge of a chain, even against its range. A
+   hinge of a curling finger that has its range against it stays undecided.
+   A jaw that turns against a fixed jaw closes at the end next to it, see `jaws`.
 3. The range alone: the only hinge of a chain closes at the far end of a range that bends away from its start; that is weak.
 """
 
@@ -224,7 +224,7 @@ class Closing:
     """
 
     def __init__(self, tree: KinematicTree, hand: Hand):
-        """Look at each joint by itself, the others half closed and then closed."""
+        """Test each joint alone, with the others half closed and then closed."""
         self.tree, self.hand, self.poses = tree, hand, Poses(tree, hand)
         self.chain = {s: i for i, chain in enumerate(hand.chains) for s in chain}
         independent = self.poses.independent if hand.length <= MAX_FINGER else ()
@@ -239,11 +239,11 @@ class Closing:
                 gain = self._gain(joint, {})
                 self.sense[joint] = float(np.sign(gain)) if abs(gain) > MIN_CLOSING else self.sense[joint]
         self.bending = self._bending(candidates)
-        others = {joint: float(np.mean(self._range(joint))) for joint in self.bending}
-        half = {joint: self._gain(joint, others) for joint in self.bending}
-        others = {joint: self._end(joint, self.sense.get(joint) or half[joint]) for joint in self.bending}
+        middles = {joint: float(np.mean(self._range(joint))) for joint in self.bending}
+        half = {joint: self._gain(joint, middles) for joint in self.bending}
+        ends = {joint: self._end(joint, self.sense.get(joint) or half[joint]) for joint in self.bending}
         # Within assumed limits fingers may pass each other: their closed ends say nothing.
-        whole = half if tree.doubt else {joint: self._gain(joint, others) for joint in self.bending}
+        whole = half if tree.doubt else {joint: self._gain(joint, ends) for joint in self.bending}
         motions = {joint: self._motion(joint, half[joint], whole[joint]) for joint in self.bending}
         self.motions = {joint: motion for joint, motion in motions.items() if motion is not None}
 
@@ -267,7 +267,7 @@ class Closing:
         return max(start - low, 0.0), max(high - start, 0.0)
 
     def _lean(self, joint: int) -> float:
-        """Return toward which end a hinge bends: ±1 if one way only, ±0.5 if it leans there, 0 if neither or of a slide."""
+        """Return the end toward which a hinge bends: ±1 if one way only, ±0.5 if it leans there; else, and for slides, 0."""
         down, up = self._sides(joint)
         low, high = self._range(joint)
         if abs(low + high) < SYMMETRIC * (high - low):
@@ -288,21 +288,21 @@ class Closing:
         return {j: float(np.sign(angle)) * axes[j] for j, angle in turned.items()}
 
     def _curling(self) -> dict[int, float]:
-        """Return the joints that curl a finger, and toward which end (±1) they do."""
+        """Return the joints that curl a finger, with the end (±1) toward which they curl it."""
         sense: dict[int, float] = {}
         for joint, lean in self.lean.items():
             if lean and not self.is_opposed(joint):
                 agreeing = [other for other in self.lean if self._is_agreeing(joint, lean, other, self.lean[other])]
                 if any(max(abs(lean), abs(self.lean[other])) == 1.0 for other in agreeing):
                     sense[joint] = float(np.sign(lean))
-        for joint, lean in self.lean.items():  # a hinge that leans to no side goes with those that it is parallel to
+        for joint, lean in self.lean.items():  # a hinge that leans to no side follows the hinges parallel to it
             if not lean and self.rotations[joint]:
                 votes = [s for s in (1.0, -1.0) if any(self._is_agreeing(joint, s, other, sense[other]) for other in sense)]
                 sense |= {joint: votes[0]} if len(votes) == 1 else {}
         return sense
 
     def _is_agreeing(self, one: int, sense: float, two: int, other: float) -> bool:
-        """Return whether two joints, or one that turns several hinges, turn hinges of a finger in the same sense."""
+        """Return whether two joints, or one joint with several hinges, turn hinges of a finger in the same sense."""
         if sense * other == 0.0 or self.is_opposed(two):
             return False
         sign = float(np.sign(sense * other))
@@ -322,7 +322,7 @@ class Closing:
         return results
 
     def _bending(self, candidates: list[int]) -> list[int]:
-        """Return the joints of which to find the closed end: those that spread fingers are not among them."""
+        """Return the joints whose closed end is sought: all except the joints that spread fingers."""
         curled = {self.chain[self.segment(joint)] for joint in self.sense}
         one_way = {joint for joint in candidates if abs(self.lean[joint]) == 1.0}
         hinges = {joint for joint in candidates if int(self.tree.model.jnt_type[joint]) == _HINGE}
@@ -339,7 +339,7 @@ class Closing:
         return results
 
     def _spreading(self, free: Set[int], one_way: Set[int]) -> set[int]:
-        """Return the joints that spread fingers: about axes across those of the hinges beyond, which bend one way or alike."""
+        """Return the joints that spread fingers: their axes cross the axes of hinges beyond that bend one way or alike."""
         alike = {one for one in free for other in free if any(abs(cosine) > PARALLEL for cosine in self._cosines(one, other))}
         path = {other: self.tree.path(self.segment(other)) for other in one_way | alike}
         axes = []

@@ -1,14 +1,14 @@
-"""Where the inner side of each link of a hand faces: None where that is not clear.
+"""Where the inner side of each link of a hand faces; None if it is not clear.
 
-A link's inner side faces where it is carried, in the open pose, as the nearest joint above it that has a lever on it closes. A
-link before all joints that close takes the side of the nearest link beyond. The last links of two chains that close on each
-other without curling face each other along the line on which they meet. A palm's inner side faces the tips as they close, a
-fixed jaw's the moving one.
+In the open pose, a link's inner side faces the direction in which the link moves as the nearest joint above it that has a lever
+on it closes. A link before all closing joints takes the side of the nearest link beyond. The last links of two chains that
+close on each other without curling face each other along the line on which they meet. A palm's inner side faces the closing
+tips, a fixed jaw's the moving jaw.
 
-What an object in front of a palm or a link can come to: not what is behind other bodies fixed to it, or beside the hand.
+`PalmFront` finds the surface of a palm that an object can reach: no surface behind other fixed bodies or outside the hand.
 
-Lengths are in metres. Heights are along the palm's inner side; a place is beside the hand if it is outside the convex outline
-of all that the fingers sweep as they close, seen from in front of the palm.
+Lengths are in metres. Heights are along the palm's inner side. A point is outside the hand if, seen from the front of the palm,
+it is outside the convex outline of the fingers' sweep as they close.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ MIN_LEVER = 0.25
 """A link whose centre is nearer to its hinge than this share of the square root of its surface turns in place, unless it is a
 single jaw."""
 LINK_SNAP, PALM_SNAP = np.radians(30.1), np.radians(40.1)
-"""A direction this close to the normal of a flat side, or to an axis of the link's frame, is taken to be that; a palm's that is
-farther is not taken. No angles that people draw: the last bits of a pose shall not decide."""
+"""A direction this close to a flat side's normal, or to an axis of the link's frame, snaps to it; a palm's direction that is
+farther is rejected. No angles that occur in drawings: the last bits of a pose must not decide."""
 FLAT, ALIKE = 0.35, np.radians(3.1)
 """Least share of the faces that look along a direction that a flat side has, and the largest angle between normals of one."""
 MAX_SIDES = 32  # faces that are tried as parts of it, from the largest on
-TURNED = np.radians(15.1)  # an axis this close to the normal of a flat side stands for it: the sides beside it are excluded
-STEP = 0.02  # share of its way by which a joint closes to see where a link goes
-MIN_COSINE = 0.5  # least cosine of the angle between directions to which fingers curl for these to say where the palm faces
+TURNED = np.radians(15.1)  # an axis this close to a flat side's normal replaces it; the adjacent sides are excluded
+STEP = 0.02  # share of its range by which a joint closes to find where a link moves
+MIN_COSINE = 0.5  # least cosine between the directions in which fingers curl, if they are to decide where the palm faces
 PARALLEL, BESIDE = 0.99, 0.25
-"""A bar beside a finger turns about an axis with at least this cosine to the finger's, nearer than this share of its length."""
+"""A bar next to a finger turns about an axis with at least this cosine to the finger's, nearer than this part of its length."""
 ALONG = 0.3  # least cosine of the angle between where a link faces and where its own hinge carries it; else its side is weak
 ALONG_HINGE = 0.7
 """Least cosine of the angle between where a link faces and the axis of a hinge beyond: fingers bend across their hinges."""
@@ -49,10 +49,10 @@ UNCLEAR = "which side is the inner one is not clear"  # why a link has no inner 
 
 @dataclass(frozen=True)
 class InnerSide:
-    """Where a link's inner side faces."""
+    """The direction of a link's inner side."""
 
     facing: tuple[float, ...] | None  # direction in the link's frame; None if it is not clear
-    doubt: str = ""  # what speaks against it, or why it is not clear; empty if nothing does
+    doubt: str = ""  # evidence against it, or why it is not clear; empty if there is none
 
 
 class Flexion:
@@ -114,14 +114,14 @@ class Flexion:
         return is_across and not any(self._is_along_hinge(segment, along) for along in carried / lever[:, None])
 
     def _bars(self) -> dict[int, int]:
-        """Return the segments that are alone in their chain and are driven with a longer chain beside them, and its first."""
+        """Return single-segment chains driven together with a longer chain next to them, with that chain's first segment."""
         chains = self.hand.chains
         single, longer = ([chain[0] for chain in chains if (len(chain) == 1) == is_single] for is_single in (True, False))
         bars = {s: other for s in single for other in longer if self._is_bar(s, other)}
         return bars if len(chains) - len(bars) > 1 else {}
 
     def _is_bar(self, segment: int, other: int) -> bool:
-        """Return whether a segment is driven together with another, about axes that are parallel to and near that one's."""
+        """Return whether a segment is driven together with another, about axes parallel and near to the other's."""
         turns = [(self._turn(pose, segment), self._turn(pose, other)) for pose in self.steps.values()]
         moved = [(one, two) for one, two in turns if np.linalg.norm(one) > 1e-6]
         parallel = all(abs(one @ two) > PARALLEL * np.linalg.norm(one) * np.linalg.norm(two) > 0 for one, two in moved)
@@ -301,18 +301,18 @@ def _flat_side(surface: Surface, direction: Float[np.ndarray, " 3"], angle: floa
 
 def _in_hundredths(direction: Float[np.ndarray, " 3"]) -> tuple[float, ...]:
     unit = direction / max(float(np.linalg.norm(direction)), 1e-9)
-    # Halves of a hundredth are rounded up, and what is just below them too.
+    # Halves of a hundredth, and numbers just below them, are rounded up.
     rounded = np.sign(unit) * np.floor(100.0 * np.abs(unit) + 0.501) / 100.0
     return tuple((rounded + 0.0).tolist())
 
 
 WITHIN_DEG = 75  # largest angle between a normal and the inner side of its link [deg]
 RASTER = 40  # rays along the longer side of a surface
-GAP = 2e-4  # what is closer in front of a surface than this is not in front of it [m]
-MIN_SHARE = 0.1  # least share of what faces an inner side, and of a link's surface, to be believed
+GAP = 2e-4  # a surface counts as in front of another from this distance on [m]
+MIN_SHARE = 0.1  # least share of the surface that faces an inner side, and of a link's surface, to count
 MARGIN, LEVEL, TOWER, AHEAD = 0.15, 0.2, 0.25, 0.1
-"""Shares of a finger's length: how far beside its fingers a hand ends, how much parts of a palm differ in height, how high
-above the joints of the fingers a tower is, and how far beside the middle of a palm the fingers must begin to be ahead of it."""
+"""Shares of a finger's length: a hand's margin around its fingers' sweep, the largest difference in height of a palm's parts,
+a tower's least height above the fingers' joints, and the least offset of the fingers from a palm's middle to be ahead of it."""
 HALF = 0.5  # a part of a palm is in front by this share, and has this share of the largest part's area
 
 
@@ -331,17 +331,17 @@ def front_of(
     is_facing = (hits.face >= 0) & (-view.normals[hits.face] @ axes[2] >= np.cos(np.radians(WITHIN_DEG)))
     pos = np.column_stack([uv, hits.depth])[is_facing] @ axes
     data, turn = tree.start, tree.start.xmat[body].reshape(3, 3).T
-    others = [
+    fixed = [
         tree.surface[other].placed(turn @ (data.xpos[other] - data.xpos[body]), turn @ data.xmat[other].reshape(3, 3))
         for other in tree.bodies[tree.segment[body]]
         if other != body
     ]
-    ahead = first_hits(OrthographicView.of(Surface.joined(others), axes), uv[is_facing]).depth if others else np.inf
+    ahead = first_hits(OrthographicView.of(Surface.joined(fixed), axes), uv[is_facing]).depth if fixed else np.inf
     return pos, np.broadcast_to(ahead >= hits.depth[is_facing] - GAP, len(pos))
 
 
 def hidden(flexion: Flexion) -> list[int]:
-    """Return the bodies of a hand whose inner side is behind other bodies that are fixed to them."""
+    """Return the bodies of a hand whose inner side is behind other bodies fixed to them."""
     tree, result = flexion.tree, list[int]()
     for body in (*flexion.hand.mounts, *flexion.hand.fingers):
         facing = flexion.inner_side(body).facing
@@ -358,10 +358,10 @@ def palm_parts(flexion: Flexion) -> list[int]:
 
 
 class PalmFront:
-    """A palm and what is fixed to it, seen from where an object comes."""
+    """A palm and the bodies fixed to it, seen from the front."""
 
     def __init__(self, flexion: Flexion):
-        """Find the outline of what the fingers sweep."""
+        """Find the outline of the fingers' sweep."""
         self.flexion, tree, hand = flexion, flexion.tree, flexion.hand
         assert hand.palm is not None
         facing = flexion.palm_side(hand.palm).facing
@@ -403,7 +403,7 @@ class PalmFront:
         return bool((free & ~is_beside & is_level).mean() >= HALF)
 
     def limit(self, body: int) -> float | None:
-        """Return how far along its inner side a body is no tower beside the hand, in its frame; None if it has none."""
+        """Return the height in its frame above which a body is a tower outside the hand [m]; None if it has no tower."""
         if self.axes is None:
             return None
         _, place, is_beside = self._points(body)
@@ -416,7 +416,7 @@ class PalmFront:
         return limit - float(self.flexion.tree.start.xpos[body] @ self.axes[2])
 
     def _points(self, body: int) -> tuple[Bool[np.ndarray, " p"], Float[np.ndarray, "p 3"], Bool[np.ndarray, " p"]]:
-        """Return whether points of a body are free, their places along `axes` [m], and whether they are beside the hand."""
+        """Return whether points of a body are free, their coordinates along `axes` [m], and whether they are off the hand."""
         facing, data = self.flexion.palm_side(body).facing, self.flexion.tree.start
         if facing is None:
             return np.zeros(0, bool), np.zeros((0, 3)), np.zeros(0, bool)

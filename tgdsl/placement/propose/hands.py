@@ -1,12 +1,12 @@
 """Which link of a robot is a palm, a finger or a fingertip: guessed from its tree of joints, never from its names.
 
-A segment is what moves as one: a body with all that is fixed to it, and the free bodies that an equality welds to it. A chain
-is what moves against a segment as a whole: a child with all below it, and with the siblings that an equality binds to it in a
-loop. A hand begins at the last segment from which two or more chains part; but where chains part again within a finger's
-length (a metacarpal with two fingers, an arch that carries the fingers while the thumb hangs on the wrist), it begins at the
-first of these. What is before it, such as an arm, and what hangs elsewhere, such as a head, is no part of it.
+A segment moves as one: a body with all bodies fixed to it, and the free bodies that an equality welds to it. A chain moves
+against a segment: a child with all bodies below it, and with the siblings that an equality binds to it in a loop. A hand begins
+at the last segment from which two or more chains part. If chains part again within a finger's length (a metacarpal with two
+fingers, an arch that carries the fingers while the thumb hangs on the wrist), it begins at the first of these segments. Bodies
+before it, such as an arm, and other branches, such as a head, are not part of the hand.
 
-Shapes: bodies and segments are MuJoCo's body indices; a segment's is that of its first body.
+Shapes: bodies and segments are MuJoCo's body indices; a segment's index is its first body's.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from scipy.spatial import ConvexHull, QhullError
 from tgdsl.formats.model import Model
 from tgdsl.surfaces.surface import Surface
 
-TURN = 2.0 * np.pi  # hinges of which none turns by more than so many degrees were most likely given in radians
-LEAST = 0.5  # at least one of them turns by so many radians if they were
-RADIANS_AS_DEGREES = float(np.degrees(1.0))  # by how much angles are larger that were read as degrees but meant as radians
+TURN = 2.0 * np.pi  # if no hinge turns by more degrees than this, the file most likely gives radians
+LEAST = 0.5  # at least one hinge then turns by so many radians
+RADIANS_AS_DEGREES = float(np.degrees(1.0))  # factor that corrects radians read as degrees
 ASSUMED = np.radians(30.0)
-"""How far a hinge without limits is taken to turn to either side of its start, where no joint with limits closes a hand."""
+"""Assumed range of a hinge without limits to either side of its start, if no joint with limits closes the hand [rad]."""
 _FREE, _HINGE, _SLIDE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "HINGE", "SLIDE"))
 _SERVO_BIAS, _FIXED_GAIN = int(mujoco.mjtBias.mjBIAS_AFFINE), int(mujoco.mjtGain.mjGAIN_FIXED)
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
@@ -46,7 +46,7 @@ def angles_are_misread(model: mujoco.MjModel) -> bool:
 
 
 def as_meant(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Return a model whose joints have the limits that are meant; the same model if they have."""
+    """Return a model with corrected joint limits; the same model if its limits are right."""
     servos, is_misread = _servo_limits(model), angles_are_misread(model)
     if not servos and not is_misread:
         return model
@@ -89,12 +89,12 @@ def _servo_limits(model: mujoco.MjModel) -> dict[int, tuple[float, float]]:
     return result
 
 
-MAX_FINGER = 0.35  # a longer chain is an arm or a leg, of which nothing closes [m]
+MAX_FINGER = 0.35  # a longer chain is an arm or a leg, which does not close [m]
 MAX_STEM = 1.5  # largest stem of a hand, in lengths of the longest chain beyond it
 MIN_TIP = 0.1  # least surface of a fingertip, as a share of the largest body fixed to it
 JAW_REACH = 0.5  # a fixed jaw reaches beyond the hinge by this share of the moving jaw's reach or more, when closed
 MIN_JAW_TURN, MAX_JAW_TURN = np.radians(19.9), np.radians(200.1)
-"""A jaw that turns by less does not grip, and what turns by more is a wrist; no angles that people draw."""
+"""A jaw that turns by less does not grip, and a hinge that turns by more is a wrist; no angles that occur in drawings."""
 _LOOPS = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 
 
@@ -125,7 +125,7 @@ class KinematicTree:
 
     @cached_property
     def welded(self) -> dict[int, int]:
-        """Bodies that move freely but for an active weld to a link of a robot, and the segment of that link."""
+        """Free bodies with an active weld to a robot's link, each with that link's segment."""
         model, segment = self.model, _rigid(self.model)
         carrying = {segment[above] for above in model.body_parentid[segment].tolist()}
         free = set(model.jnt_bodyid[model.jnt_type == _FREE].tolist()) - carrying
@@ -136,7 +136,7 @@ class KinematicTree:
         return result
 
     def carry_welded(self, data: mujoco.MjData) -> None:
-        """Put the welded bodies where their links carry them."""
+        """Move the welded bodies with their links."""
         for body, segment in enumerate(_rigid(self.model) if self.welded else ()):
             if (host := self.welded.get(segment)) is not None:
                 then, now = (state.xmat[host].reshape(3, 3) for state in (self.start, data))
@@ -230,14 +230,14 @@ class Hand:
     """Palm, fingers and tips found in a kinematic tree."""
 
     base: int  # segment from which the chains part; 0 if that is the world
-    mounts: list[int]  # bodies of it that have surface; where chains part, without those before the one that carries them
-    palm: int | None  # the largest mount, of those that carry all chains if any does; None without one or with one chain
+    mounts: list[int]  # the base's bodies that have surface, without bodies before the one from which the chains part
+    palm: int | None  # the largest mount, preferably one that carries all chains; None without a mount or with one chain
     chains: list[list[int]]  # segments of each chain
     tips: list[int]  # bodies at the ends of the chains
     fingers: list[int]  # all bodies that move against the base, tips included
     length: float  # length of the longest chain [m]
-    jaw: int | None = None  # of a gripper of one jaw, the body of the base that this closes on
-    closes: float = 0.0  # toward which end of its range, ±1, this jaw closes; 0 of other hands
+    jaw: int | None = None  # for a gripper with one moving jaw, the body of the base on which it closes
+    closes: float = 0.0  # the end of its range, ±1, toward which the moving jaw closes; 0 for other hands
 
 
 def kinematic_tree(robot: Model, surface: Mapping[str, Surface]) -> KinematicTree:

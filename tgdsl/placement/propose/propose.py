@@ -37,7 +37,7 @@ COVERING = 0.75  # radius over the square root of the area per taxel: discs on a
 ROOM = 1e-3  # a box is larger than a link's surface by this [m]
 BEFORE = "before the link from which the fingers part; --include adds it"
 BESIDE = "no part of a hand; --include adds it"
-NO_LIMITS = "no joint of the hand has limits: its hinges are taken to turn by 30 deg to either side"
+NO_LIMITS = "no joint of the hand has limits: its hinges are assumed to turn by 30 deg to either side"
 SCENERY = "stands or floats by itself: taken for scenery or an object; --include adds it"
 NESTED = {"tips": (), "palm": (), "fingers": ("tips",), "hand": ("fingers", "palm", "tips")}
 """The groups, and by which others each is written where it holds all their links."""
@@ -82,8 +82,8 @@ class Proposal:
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:
         """The groups that have links, as selections; `fingers` and `hand` name groups that they contain."""
-        known = {name for name, links in self.members.items() if links}
-        return {name: self._selection(name, known) for name in self.members if name in known}
+        nonempty = {name for name, links in self.members.items() if links}
+        return {name: self._selection(name, nonempty) for name in self.members if name in nonempty}
 
     def _selection(self, group: str, known: set[str]) -> tuple[str, ...]:
         links, inner, covered = self.members[group], list[str](), set[str]()
@@ -168,11 +168,11 @@ class Draft:
     def change(self, names: Collection[str], density: float | None = None, **region: Any) -> None:
         """Change the density [1/m²] of links, or their region: `facing`, `within` and `box` of `LinkProposal`.
 
-        A density that all links have becomes the layout's. What is as it was guessed counts as a guess again.
+        A density common to all links becomes the layout's. A value equal to its guess counts as a guess again.
 
         Raises:
-            TgdslError: If the density is not positive or asks for too many taxels, or a region has nothing of a link's surface.
-                Then nothing is changed.
+            TgdslError: If the density is not positive or asks for too many taxels, or a region misses a link's surface. The
+                proposal then stays unchanged.
         """
         if density is not None and not density > 0:
             raise TgdslError(f"density: {density * 1e-4:g}/cm2 is out of range, expected more than 0")
@@ -188,8 +188,8 @@ class Draft:
     def set_group(self, group: str, names: Collection[str]) -> None:
         """Give a group other links."""
         members = {**self.proposal.members, group: tuple(name for name in self._surfaces if name in names)}
-        chosen = frozenset(name for name, links in members.items() if links != self._members[name])
-        self.proposal = replace(self.proposal, members=members, chosen_groups=chosen)
+        changed = frozenset(name for name, links in members.items() if links != self._members[name])
+        self.proposal = replace(self.proposal, members=members, chosen_groups=changed)
 
     def bounds(self, name: str) -> Box:
         """Return the corners of a box around a link's surface, in its frame [m]."""
@@ -264,20 +264,20 @@ def _closing(flexions: Sequence[Flexion]) -> list[Flexion]:
 
 
 def _outside(tree: KinematicTree, flexions: Sequence[Flexion]) -> dict[int, str]:
-    """Return the bodies with surface that are in no hand, and why a layout leaves them out."""
+    """Return the bodies with surface outside all hands, with the reason why a layout leaves them out."""
     within = {body for flexion in flexions for body in (*flexion.hand.mounts, *flexion.hand.fingers)}
-    before = {s for flexion in flexions for s in tree.path(flexion.hand.base)[1:]}
+    ancestors = {s for flexion in flexions for s in tree.path(flexion.hand.base)[1:]}
     carrying = {b for flexion in flexions for m in flexion.hand.mounts for b in tree.within(flexion.hand.base, m)}
     scenery = set(free_standing(tree))
     result: dict[int, str] = {}
     for body in sorted(tree.surface.keys() - within):
-        is_before = tree.segment[body] in before or body in carrying
+        is_before = tree.segment[body] in ancestors or body in carrying
         result[body] = SCENERY if body in scenery else BEFORE if is_before else BESIDE
     return result
 
 
 def _included(patterns: Sequence[str], names: Sequence[str], left_out: Mapping[str, str]) -> set[str]:
-    """Return the links that some patterns ask for."""
+    """Return the links that match the patterns."""
     result: set[str] = set()
     for pattern in patterns:
         links = {pattern} & {*names} or {*matching(pattern, names)}
@@ -324,7 +324,7 @@ def _sampled_hands(
 
 
 def _boxes(flexion: Flexion) -> dict[int, Box]:
-    """Return the boxes of the mounts of a hand that hold a tower beside it: they end where this rises above the rest."""
+    """Return a box for each mount with a tower outside the hand: it ends where the tower rises above the rest."""
     result: dict[int, Box] = {}
     if flexion.hand.palm is None:
         return result
@@ -340,14 +340,14 @@ def _boxes(flexion: Flexion) -> dict[int, Box]:
 
 
 def _around(surface: Surface) -> Box:
-    """Return the corners of a box around a surface, with some room [m]."""
+    """Return the corners of a box around a surface, with a margin [m]."""
     corners = surface.corners.reshape(-1, 3)
     low, high = (corners.min(axis=0) - ROOM).round(4), (corners.max(axis=0) + ROOM).round(4)
     return tuple(low.tolist()), tuple(high.tolist())
 
 
 def _link(name: str, surface: LinkSurface, side: InnerSide, box: Box | None, density: float) -> LinkProposal:
-    """Return the guess of a link: all around where too little of it faces its inner side."""
+    """Return a link's guess: its whole surface if too little of it faces the inner side."""
     result = LinkProposal(name, density, side.facing, side.doubt, None if side.facing is None else box, 0.0, {}, {})
     if _share(result, surface) < MIN_SHARE:
         result = replace(result, facing=None, doubt=UNCLEAR, box=None)

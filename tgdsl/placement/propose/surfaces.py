@@ -1,7 +1,7 @@
-"""The surfaces of a robot's links: triangles, which say where links are; and samples of what can be touched, which are slow.
+"""The surfaces of a robot's links: triangles for the links' geometry, and samples of the touchable surface, which are slow.
 
-A link is sampled on its meshes as they are, unless these have hollows that are deeper inside the hulls that the simulator
-collides than a taxel's radius; what is inside other colliding geoms in the initial state is left out.
+A link is sampled on its meshes, unless their hollows are deeper inside the collision hulls than a taxel's radius. Surface
+inside other colliding geoms in the initial state is left out.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tgdsl.surfaces.region import Region
 from tgdsl.surfaces.surface import Surface
 
 NOT_COLLIDED = "the simulator does not collide it, so contacts never reach it"
-HIDDEN = "behind what is fixed in front of it; --include adds it"
+HIDDEN = "behind bodies fixed in front of it; --include adds it"
 COVERED = "all of it is inside other links in the initial state"
 MAX_MARKER = 2e-5  # largest surface of a marker, such as a ball of a millimetre at a fingertip [m²]
 MIN_AREA = 1e-8  # a surface smaller than this is degenerate [m²]
@@ -107,7 +107,7 @@ class Sampler:
         return self._exposed(name, pool, radius) if name in self._feeling else LinkSurface(pool)
 
     def _exposed(self, name: str, pool: Pool, radius: float) -> LinkSurface | str:
-        """Return what can feel of a colliding link, of which points on its meshes are given."""
+        """Return the exposed surface of a colliding link, from points on its meshes."""
         geoms, options = self.robot.touchable(name), dict[str, str | bool]()
         if not all(geom.is_colliding for geom in geoms):
             return LinkSurface(pool)
@@ -127,7 +127,7 @@ class Sampler:
         return LinkSurface(pool, options) if pool.area > MIN_AREA else COVERED
 
     def _pool(self, name: str, as_collided: bool) -> Pool | None:
-        """Return points on the outside of a link's surface; None if none of it can be touched from outside."""
+        """Return points on the outer surface of a link; None if nothing of it can be touched from outside."""
         if (name, as_collided) not in self._pools:
             try:
                 shell = meshlab.outer_shell(self.robot.surface(self.robot.touchable(name), as_collided))

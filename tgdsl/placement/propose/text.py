@@ -1,4 +1,4 @@
-"""A proposed layout as YAML with comments: what was guessed, and what to edit."""
+"""A proposed layout as YAML with comments on its guesses and on the values to edit."""
 
 from __future__ import annotations
 

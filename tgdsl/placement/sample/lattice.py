@@ -1,14 +1,14 @@
-"""Points of a surface on the lines of three fixed lattices, so that where they are drawn does not depend on its triangles.
+"""Points of a surface on the lines of three fixed lattices: their positions do not depend on the surface's triangles.
 
 Each of the three families of lines runs along one axis of the body frame and has one line in each square of a lattice of some
-pitch h that is fixed in space; where in its square a line runs is a hash of the seed, the axis and the square's integer
-coordinates. A point is where a line passes through a face. So two of its three coordinates, and its priority, are the same bits
-whatever the order of faces, the numbers of vertices or the triangles that a flat face is cut into, and when vertices move by δ
-the third moves by δ over the cosine of line and normal: no point depends on any other one, nor on how many there are.
+pitch h that is fixed in space. A line's place in its square is a hash of the seed, the axis and the square's integer
+coordinates. A point is the intersection of a line and a face. Two of its coordinates, and its priority, keep their bits for any
+order of faces, any numbering of vertices and any triangulation of a flat face. If vertices move by δ, the third coordinate
+moves by δ over the cosine of line and normal. No point depends on other points, nor on their number.
 
-Lines count where they meet a face steeply, |n_a| ≥ 0.37 for the unit normal n and the axis a: one family always does, and of
-one that grazes a face no point is where it seems. A face is met by |n_a| / h² lines of family a per area, and a point counts
-for the area h² |n_a| / Σ n_b², the sum over the families that count: together they count for the face's own.
+Lines count where they meet a face steeply, |n_a| ≥ 0.37 for the unit normal n and the axis a: one family always does, and
+the points of a family that grazes a face are inaccurate. A face is met by |n_a| / h² lines of family a per area. A point
+stands for the area h² |n_a| / Σ n_b², summed over the families that count: the points' areas add up to the face's.
 
 Shapes: `piece` triangles, `strip` (piece, column of squares) pairs, `pair` (piece, square) pairs, `hit` points.
 Everything is in the body frame.
@@ -23,14 +23,14 @@ from jaxtyping import Bool, Float, Int
 
 from tgdsl.surfaces.rays import expanded
 
-STEPS_PER_OCTAVE = 4  # pitches are powers of 2 to the quarter: a pitch shall not follow the last bits of an area
-STEEP = 0.37  # least |cosine| of line and normal; no more than 1/√3, and no angle that people draw
-_MARGIN = 1e-9  # of a pitch: squares that are touched only by rounding are looked at too
+STEPS_PER_OCTAVE = 4  # pitches are powers of 2 to the quarter: a pitch must not follow the last bits of an area
+STEEP = 0.37  # least |cosine| of line and normal; no more than 1/√3, and no angle that occurs in drawings
+_MARGIN = 1e-9  # share of a pitch: squares that are touched only by rounding are searched too
 
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where lines pass through faces, in random order: that of a hash of the line, and along one line by position."""
+    """Intersections of lines and faces, ordered by a hash of the line, and along one line by position."""
 
     pos: Float[np.ndarray, "hit 3"]  # position in the body frame [m]
     piece: Int[np.ndarray, " hit"]  # index of the triangle

@@ -5,12 +5,11 @@ may be joined to the outside by a pinhole.
 
 Poisson-disk samplers of pymeshlab, libigl and trimesh have no exact count and no region, and follow the mesh's order of faces.
 So the pool is drawn on lines that are fixed in space (`lattice`), or on request by pymeshlab's stratified sampling of
-triangles, which draws no random numbers. Each point has a priority, and points are taken by dart throwing in the order of
-their priorities: at one spacing, or, for an exact count, at spacings that fall along a fixed series
-until there are enough. Hence a mesh whose vertices are off by rounding gives the same samples: a decision changes only where a
-distance equals a spacing to within the rounding, and then one or two neighbours change with it. Sample elimination (Yuksel
-2015) compares sums of eighth powers of distances: thirty times as many of its choices change. Distances are straight lines, not
-paths along the surface.
+triangles, which draws no random numbers. Dart throwing selects points in the order of their priorities: at one spacing, or, for
+an exact count, at a fixed decreasing series of spacings until there are enough. Hence a mesh whose vertices are off by rounding
+gives the same samples: a decision changes only where a distance equals a spacing to within the rounding, and then one or two
+neighbours change with it. Sample elimination (Yuksel 2015) compares sums of eighth powers of distances: thirty times as many
+of its choices change. Distances are straight lines, not paths along the surface.
 
 Shapes: `piece` triangles cut from faces, `hit` points drawn, `pool` points of the pool, `n` some points, `taxel` the points
 chosen. Everything is in the body frame.
@@ -32,11 +31,11 @@ from tgdsl.surfaces.surface import Surface
 
 CANDIDATES = 20  # least number of points per sample from which an exact count is chosen
 DIRECTIONS, FIRST_DIRECTIONS = 100, 10
-"""Directions from which points are looked at: what none of them sees is a pocket that nothing outside can touch. Whether what
-the first ones do not see is inside of solids is found before it is looked at from the others."""
+"""View directions: a point that none of them sees is in a pocket that nothing outside can touch. Points that the first ones
+do not see are first tested for being inside of solids, then viewed from the other directions."""
 PER_SAMPLE = 50  # points per sample by which the area of each sample is measured; also the density of the pool for a spacing
 MIN_POOL, MAX_POOL = 10_000, 400_000  # points in a pool; more are drawn only where an exact count needs them
-MANY = 30  # points by which the area of a piece is known well enough to set it right for this piece alone
+MANY = 30  # points from which on a piece's area is corrected for this piece alone
 FIRST_SPACING, SPACING_RATIO = 0.81, 0.99
 """Of an exact count: the largest first spacing, relative to the hexagonal packing's, at which nearly all samples fit; and each
 next one relative to the one before."""
@@ -65,11 +64,11 @@ def pool(
     face, corners = _pieces(shell.surface, region)
     area = float(_areas(corners).sum())
     limit = MAX_POOL * 4 if count is None else size(count)[1]
-    point_area, drawn = area / _wanted(0.0, count, spacing), None
+    point_area, drawn = area / _pool_size(0.0, count, spacing), None
     while len(face):
         num = area / point_area
         drawn = _drawn(shell, region, face, corners, point_area, seed, sampler)
-        num_drawn, num_wanted = len(drawn.pos), _wanted(drawn.area, count, spacing)
+        num_drawn, num_wanted = len(drawn.pos), _pool_size(drawn.area, count, spacing)
         is_hopeless = num >= limit or (count is None and num_wanted > MAX_POOL) or (not num_drawn and num >= 10 * MIN_POOL)
         if num_drawn > 0.7 * num_wanted or is_hopeless:
             break
@@ -81,8 +80,8 @@ def size(count: int) -> tuple[int, int]:
     return max(min(PER_SAMPLE * count, MAX_POOL), 2 * CANDIDATES * count, MIN_POOL), 4 * max(MAX_POOL, CANDIDATES * count)
 
 
-def _wanted(area: float, count: int | None, spacing: float | None) -> float:
-    """Return how many points the pool of a region of some area [m²] should have."""
+def _pool_size(area: float, count: int | None, spacing: float | None) -> float:
+    """Return the number of points for the pool of a region of some area [m²]."""
     if count is None:
         assert spacing is not None
         return max(PER_SAMPLE * area / spacing**2, float(MIN_POOL))
@@ -126,7 +125,7 @@ def _drawn(
 
 
 def _stratified(corners: Float[np.ndarray, "piece 3 3"], point_area: float, seed: int) -> lattice.Hits:
-    """Return points that pymeshlab draws, in random order: its own is that of the faces."""
+    """Return pymeshlab's points in random order: pymeshlab returns them in the order of the faces."""
     area = float(_areas(corners).sum())
     pos, piece = stratified_points(corners, int(np.ceil(area / point_area)))
     order = np.random.default_rng(seed).permutation(len(pos))
@@ -134,7 +133,7 @@ def _stratified(corners: Float[np.ndarray, "piece 3 3"], point_area: float, seed
 
 
 def _exact(drawn: lattice.Hits, area: Float[np.ndarray, " piece"]) -> Float[np.ndarray, " hit"]:
-    """Return areas of points that add up to those of their pieces, which a lattice knows to some percent only [m²]."""
+    """Return areas of points that add up to their pieces' areas [m²]; a lattice's areas are off by some percent."""
     num = np.bincount(drawn.piece, minlength=len(area))
     owner = np.where(num >= MANY, np.arange(len(area)), len(area))
     drawn_area = np.bincount(owner[drawn.piece], drawn.area, minlength=len(area) + 1)
@@ -191,7 +190,7 @@ def choose(pool: Pool, count: int | None, spacing: float | None) -> Int[np.ndarr
         taken = _dart_throwing(pool.pos, (spacing,), len(pool.pos))
     else:
         hexagonal = np.sqrt(2.0 * pool.area / (np.sqrt(3.0) * count))
-        # The first is one of a fixed series too, 4 % apart: it shall not follow the last bits of an area.
+        # The first is one of a fixed series too, 4 % apart: it must not follow the last bits of an area.
         first = 4.0 * np.ceil(np.log(FIRST_SPACING * hexagonal) / np.log(SPACING_RATIO) / 4.0)
         least = np.log(1e-3) / np.log(SPACING_RATIO)
         taken = _dart_throwing(pool.pos, tuple(SPACING_RATIO ** np.arange(first, first + least)), count)
@@ -199,7 +198,7 @@ def choose(pool: Pool, count: int | None, spacing: float | None) -> Int[np.ndarr
 
 
 def _dart_throwing(pos: Float[np.ndarray, "pool 3"], spacings: tuple[float, ...], count: int) -> Int[np.ndarray, " taxel"]:
-    """Take points in order, those at least a spacing [m] away from all that were taken; then with the next smaller spacing."""
+    """Select points in order that are at least a spacing [m] from all selected points; then with the next smaller spacing."""
     tree = KDTree(pos)
     gap = np.full(len(pos), np.inf)  # to the nearest point taken, if that is within the first spacing
     taken: list[int] = []

@@ -28,7 +28,7 @@ MAX_DENSITY = poisson.MAX_POOL / poisson.PER_SAMPLE
 """Largest area per squared spacing: about 0.7 times as many samples fit, and the pool resolves no finer spacing."""
 
 Drawn = dict[Hashable, Any]
-"""Pools of points, and rectangles in which grids are seen, on one surface, by what of a placement they depend on."""
+"""Pools of points, and grids' visible rectangles, on one surface, by the placement's options that they depend on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ def _grid(surface: Surface, placement: Grid, is_covered: Covered | None, drawn: 
     rectangle = drawn[seen]
     if rectangle is None:
         problem = "the region" if placement.region else "the link's exposed surface" if is_covered else "the link's surface"
-        raise SampleError(f"no part of {problem} is seen along {_shown(placement.direction)}", "turn `direction`")
+        raise SampleError(f"no part of {problem} is visible along {_vector(placement.direction)}", "turn `direction`")
     cell = np.stack(np.divmod(np.arange(placement.rows * placement.columns), placement.columns), axis=-1)
     num = np.array([placement.columns, placement.rows])
     low, high = rectangle
@@ -87,20 +87,20 @@ def _grid(surface: Surface, placement: Grid, is_covered: Covered | None, drawn: 
     step = np.column_stack([placement.rows - 1 - cell[:, 0], cell[:, 1]]) if placement.rows_reversed else cell
     uv = low + (step[:, ::-1] + 0.5) * pitch
     hits = first_hits(view, uv)
-    chosen = np.flatnonzero(hits.face >= 0)
-    pos = np.column_stack([uv[chosen], hits.depth[chosen]]) @ view.axes
-    face = hits.face[chosen]
+    hit = np.flatnonzero(hits.face >= 0)
+    pos = np.column_stack([uv[hit], hits.depth[hit]]) @ view.axes
+    face = hits.face[hit]
     is_in = region.has_faces(view.normals[face], view.geom[face]) & region.has_points(pos)
-    kept = np.flatnonzero(is_in)[_central(placement, cell[chosen[is_in]], pitch)]
-    normal = view.normals[face[kept]]
+    central = np.flatnonzero(is_in)[_central(placement, cell[hit[is_in]], pitch)]
+    normal = view.normals[face[central]]
     cosine = np.abs(normal @ view.axes[2])
     return Samples(
-        pos=pos[kept],
+        pos=pos[central],
         normal=normal,
         tangent=_tangent(normal, view.axes[0], -view.axes[1] if placement.rows_reversed else view.axes[1]),
-        radius=np.full(len(kept), placement.radius),
+        radius=np.full(len(central), placement.radius),
         area=pitch.prod() / np.maximum(cosine, MIN_COSINE),
-        cell=cell[chosen[kept]],
+        cell=cell[hit[central]],
     )
 
 
@@ -111,17 +111,17 @@ def _grid_axes(placement: Grid) -> Float[np.ndarray, "3 3"]:
         return frame(direction)
     columns = unit(np.array(placement.columns_along))
     if np.linalg.norm(np.cross(direction, columns)) < 1e-6:
-        problem = f"`columns_along` {_shown(placement.columns_along)} is parallel to `direction`"
-        raise SampleError(f"{problem} {_shown(placement.direction)}", "choose an axis across it")
+        problem = f"`columns_along` {_vector(placement.columns_along)} is parallel to `direction`"
+        raise SampleError(f"{problem} {_vector(placement.direction)}", "choose an axis across it")
     return frame(direction, columns)
 
 
 def _central(placement: Grid, cell: Int[np.ndarray, "hit 2"], pitch: Float[np.ndarray, " 2"]) -> Int[np.ndarray, " kept"]:
-    """Return which of the cells that hit are kept, ascending: all, or the `count` nearest the rectangle's centre."""
+    """Return the indices of the cells to use, ascending: all hits, or the `count` nearest the rectangle's centre."""
     total = placement.rows * placement.columns
     if not len(cell):
-        problem = f"none of the grid's {total} cells hits the surface along {_shown(placement.direction)}"
-        opposite = _shown(tuple(0.0 - component for component in placement.direction))
+        problem = f"none of the grid's {total} cells hits the surface along {_vector(placement.direction)}"
+        opposite = _vector(tuple(0.0 - component for component in placement.direction))
         hint = f"`direction` points into the surface: is {opposite} meant? Else give more `rows` and `columns`"
         raise SampleError(problem, hint)
     if placement.count is None:
@@ -161,26 +161,26 @@ def _poisson(surface: Surface, placement: Poisson, is_covered: Covered | None, d
         least = np.sqrt(pool.area / MAX_DENSITY)
         problem = f"a spacing of {placement.spacing:g} m is too fine for a surface of {pool.area:.3g} m²"
         raise SampleError(problem, f"expected at least {least:.2g} m")
-    chosen = poisson.choose(pool, placement.count, placement.spacing)
-    normal = pool.normal[chosen]
+    points = poisson.choose(pool, placement.count, placement.spacing)
+    normal = pool.normal[points]
     return Samples(
-        pos=pool.pos[chosen],
+        pos=pool.pos[points],
         normal=normal,
         tangent=_tangent(normal, reference_axes(normal)),
-        radius=np.full(len(chosen), placement.radius),
-        area=poisson.voronoi_areas(pool, chosen),
-        cell=np.full((len(chosen), 2), -1),
+        radius=np.full(len(points), placement.radius),
+        area=poisson.voronoi_areas(pool, points),
+        cell=np.full((len(points), 2), -1),
     )
 
 
 def _points(table: PointTable) -> Samples:
-    """Take points as they are: nothing is projected, and what is unit and perpendicular already keeps its bits."""
+    """Return a table's points, without projection; unit and perpendicular vectors keep their bits."""
     normal = _kept_unit(table.normal)
     tangent = _tangent(normal, reference_axes(normal))
-    given = np.flatnonzero(~np.isnan(table.tangent[:, 0]))
-    along = _kept_unit(table.tangent[given])
-    is_across = np.abs((along * normal[given]).sum(axis=1)) <= ROUNDED
-    tangent[given] = np.where(is_across[:, None], along, _tangent(normal[given], along))
+    rows = np.flatnonzero(~np.isnan(table.tangent[:, 0]))
+    along = _kept_unit(table.tangent[rows])
+    is_across = np.abs((along * normal[rows]).sum(axis=1)) <= ROUNDED
+    tangent[rows] = np.where(is_across[:, None], along, _tangent(normal[rows], along))
     area = np.where(np.isnan(table.area), np.pi * table.radius**2, table.area)
     return Samples(table.pos, normal, tangent, table.radius, area, table.cell)
 
@@ -190,7 +190,7 @@ def _kept_unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     return np.where(is_unit[:, None], vectors, unit(vectors))
 
 
-def _shown(vector: tuple[float, ...]) -> str:
+def _vector(vector: tuple[float, ...]) -> str:
     return "[" + ", ".join(f"{component:g}" for component in vector) + "]"
 
 
@@ -250,16 +250,16 @@ def _columns(rows: Sequence[Mapping[str, float]], names: Sequence[str], default:
 
 
 def _values(point: Point) -> dict[str, float]:
-    """Return what a point in a layout gives, by the names of a file's columns."""
+    """Return a layout point's values, by the names of a file's columns."""
     values = dict(zip(REQUIRED, (*point.pos, *point.normal), strict=True))
     if point.tangent is not None:
         values |= dict(zip(TANGENT, point.tangent, strict=True))
-    others = {"radius": point.radius, "area": point.area, "row": point.row, "column": point.column}
-    return values | {name: value for name, value in others.items() if value is not None}
+    optional = {"radius": point.radius, "area": point.area, "row": point.row, "column": point.column}
+    return values | {name: value for name, value in optional.items() if value is not None}
 
 
 def _read(folder: Path, name: str, link: str) -> Iterator[tuple[str, dict[str, float]]]:
-    """Yield the place and the numbers of each row of a CSV file that is a link's; empty cells have none."""
+    """Yield the place and the numbers of each of a link's rows of a CSV file; empty cells have none."""
     try:
         text = (folder / name).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -291,7 +291,7 @@ def _read(folder: Path, name: str, link: str) -> Iterator[tuple[str, dict[str, f
 
 
 def _check_header(name: str, header: Sequence[str]) -> None:
-    """Raise a `SampleError` unless a file's columns are known, each there once, and all that there must be."""
+    """Raise a `SampleError` unless a file's columns are known and unique, and none is missing."""
     for i, column in enumerate(header):
         if column not in REQUIRED + OPTIONAL:
             raise SampleError(f'{name}:1: unknown column "{column}"', did_you_mean(column, REQUIRED + OPTIONAL))
@@ -310,9 +310,9 @@ def _check(place: str, values: Mapping[str, float], radius: float | None) -> Non
     if not any(values[column] for column in REQUIRED[3:]):
         raise SampleError(f"{place}: normal [0, 0, 0] has no direction", "expected a vector of non-zero length")
     for whole in (TANGENT, CELL):
-        given = [column for column in whole if column in values]
-        if given and len(given) < len(whole):
-            raise SampleError(f"{place}: {', '.join(given)} without the others of {', '.join(whole)}", "give all or none")
+        present = [column for column in whole if column in values]
+        if present and len(present) < len(whole):
+            raise SampleError(f"{place}: {', '.join(present)} without the others of {', '.join(whole)}", "give all or none")
     if TANGENT[0] in values:
         normal, tangent = (np.array([values[column] for column in columns]) for columns in (REQUIRED[3:], TANGENT))
         normal, tangent = normal / np.abs(normal).max(), tangent / max(np.abs(tangent).max(), np.finfo(float).tiny)
@@ -325,7 +325,7 @@ def _check_cells(places: Sequence[str], cell: Int[np.ndarray, "point 2"]) -> Non
     first: dict[tuple[int, ...], str] = {}
     for place, (row, column) in zip(places, cell.tolist(), strict=True):
         if min(row, column) >= 0 and (other := first.setdefault((row, column), place)) != place:
-            raise SampleError(f"{place}: row {row}, column {column} is that of {other} too", "one point for each cell")
+            raise SampleError(f"{place}: row {row}, column {column} is used by {other} too", "one point for each cell")
 
 
 def _number(place: str, column: str, text: str) -> float:
