@@ -10,7 +10,7 @@ from tgdsl.commands.distill import Distill
 from tgdsl.commands.train import Train
 
 FOLDER = Path(__file__).parents[2] / "examples" / "tasks" / "published"
-pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+pytestmark = [pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning"), pytest.mark.usefixtures("no_onnx")]
 FEW = {"in_palm_rotate": (), "in_hand_repose": (), "screwdriver": ("grasps.num=8",)}
 
 
@@ -22,7 +22,7 @@ def test_each_document_is_tried():
 @pytest.mark.parametrize("name", FEW)
 def test_a_teacher_and_its_students_learn_a_few_iterations(name, tmp_path):
     document, out = FOLDER / f"{name}.yaml", tmp_path / "teacher"
-    Train(document, device="cpu", envs=16, iterations=2, episodes=0, out=out, set=FEW[name]).run()
+    Train(document, device="cpu", envs=4, iterations=2, episodes=0, out=out, set=FEW[name]).run()
     card = json.loads((out / "policy.json").read_text())
     goal = {"in_palm_rotate": 1, "in_hand_repose": 13}
     assert card["groups"].get("goal") == goal.get(name) and card["groups"]["priv_touch"] == 15
