@@ -84,7 +84,7 @@ def test_mistakes(base, here):
     cases = {
         ("--policy", "none.pt"): "tgdsl: none.pt: cannot read this file: No such file or directory\n",
         (*policy, "--source", "gazebo"): 'tgdsl: unknown source "gazebo"; expected "simulation"',
-        (*policy, "--source", "xhand1:/dev/none"): 'tgdsl: student.pt: the task "press.py:Press" draws what it asks for',
+        (*policy, "--source", "xhand1:/dev/none"): 'tgdsl: student.pt: the task "press.py:Press" draws its goal from its scene',
         (*policy, "--source", "xhand1:/dev/none", "--goal", "1"): "tgdsl: /dev/none cannot be opened",
         (*policy, "--goal", "7"): "tgdsl: goal: a bend of 7 rad; expected 0.5 to 1.5 rad (`bend` of the task's document)\n",
         (*policy, "--kp", "3"): "tgdsl: --speed, --current-limit: missing; a hand moves only with a speed, a current limit",

@@ -135,7 +135,7 @@ def test_another_seed_and_other_sensors_are_told_and_what_a_version_did_not_know
     begun = "changed since the run began: "
     assert [line.removeprefix(begun) for line in out.splitlines() if begun in line] == [
         'touch: "bool", now "none"',
-        "what is compiled of the sensors' document",
+        "the compiled module of the sensors' document",
     ]
 
 

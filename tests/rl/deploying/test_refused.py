@@ -29,7 +29,7 @@ def policy(task):
     ("options", "error", "message"),
     [
         ({"source": "gazebo"}, TgdslError, 'unknown source "gazebo"'),
-        ({"source": PORT}, DeployError, "student.pt: the task .* draws what it asks for by what is in its scene, and xhand1:"),
+        ({"source": PORT}, DeployError, "student.pt: the task .* draws its goal from its scene, and xhand1:"),
         ({"goal": (9.0,)}, DeployError, "goal: a bend of 9 rad; expected 0.5 to 1.5 rad .`bend` of the task's document"),
         ({"goal": (1.0, 2.0)}, DeployError, r"goal: found 2 numbers, but of the task .* expected 1 \[rad\]"),
         ({"start": "home"}, SimulationError, 'the scene has no keyframe "home"'),

@@ -2,13 +2,12 @@
 
 Observations are a dictionary of groups, actions from −1 to 1 for each joint. An environment whose episode ends begins the next
 one in the same step (`AutoresetMode.SAME_STEP`): `info["final_obs"]` has the last observations of the old one,
-`info["final_info"]` those of its last step. Entries of `info` are those of `StepInfo`, each with its mask under `_` and
-its name.
+`info["final_info"]` its last step's entries. `info` has the entries of `StepInfo`, each with its mask under `_` and its name.
 
-Of gymnasium's wrappers, those of observations (`FlattenObservation`, `NormalizeObservation`, …) refuse every environment of
-this mode: the argument `groups` leaves out what a policy shall not see. `NumpyToTorch` cannot convert `final_obs` as an array:
-`output="torch"` takes its place. All others take this environment with `output="numpy"`; they compute with arrays, so that with
-`output="torch"` all but `TransformReward` raise.
+Gymnasium's observation wrappers (`FlattenObservation`, `NormalizeObservation`, …) refuse every environment of this mode: use
+the argument `groups` to leave out groups. `NumpyToTorch` cannot convert `final_obs` as an array: use `output="torch"` instead.
+All other wrappers take this environment with `output="numpy"`; they compute with arrays, so with `output="torch"` only
+`TransformReward` works.
 
 Shapes: `env` environments, `joint` joints that the policy moves.
 """
@@ -35,15 +34,15 @@ except ImportError as error:
 
 Output = Literal["numpy", "torch"]
 STEP_KEYS = ("terms", "score", "episode_return", "episode_steps", "episode_terms", "faults")
-"""What `info` has of each step: see `StepInfo`."""
+"""Entries of `info` for each step: see `StepInfo`."""
 
 
 class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
-    """Environments of gymnasium: a translation of a `TouchEnv`, to which it adds nothing.
+    """A `TouchEnv` with gymnasium's interface, and nothing added.
 
-    With `output="numpy"`, `info` is what gymnasium's `SyncVectorEnv` gives: masks that are nowhere true are left out, as is
-    what they mask; `final_obs` is an array of dictionaries. With `output="torch"` nothing is copied to the host: masks are
-    always there, rows that they leave out mean nothing, and `final_obs` is a dictionary of tensors.
+    With `output="numpy"`, `info` is as in gymnasium's `SyncVectorEnv`: entries whose mask is false everywhere are missing;
+    `final_obs` is an array of dictionaries. With `output="torch"` nothing is copied to the host: all masks are present, rows
+    outside of a mask are undefined, and `final_obs` is a dictionary of tensors.
 
     Attributes:
         touch_env: The `TouchEnv`.
@@ -57,7 +56,7 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
             touch_env: The environment; `close` closes it.
             output: Whether observations, rewards and ends are NumPy arrays or tensors on the environment's device; actions may
                 always be either.
-            groups: Groups of observations to hand out, in this order; default: all.
+            groups: Groups of observations to return, in this order; default: all.
 
         Raises:
             TgdslError: If there is no such output or group.
@@ -84,14 +83,14 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
         """Begin a new episode in all environments; return observations by group, (env, feature) each, and an empty dictionary.
 
         Args:
-            seed: What all that is random follows from; default: go on.
+            seed: Seed of all random numbers; default: continue with the current numbers.
             options: None or empty: there are none.
 
         Raises:
             TgdslError: If there is a seed per environment, or an option.
         """
         if isinstance(seed, Sequence):
-            raise TgdslError(f"seed is {seed!r}: expected one whole number for all environments, which makes those of each")
+            raise TgdslError(f"seed is {seed!r}: expected one whole number for all environments, which seeds each of them")
         if options:
             raise TgdslError(f"reset has no options, found {', '.join(map(repr, options))}: all environments begin again")
         new_seed = None if seed is None else index(seed)

@@ -1,11 +1,11 @@
 """A `TouchEnv` as a `VecEnv` of rsl_rl 5.4 or later.
 
-Groups of observations are a TensorDict, of which the runner's `obs_groups` takes what actor and critic see.
-`extras["time_outs"]` are episodes that have merely lasted long enough. `extras["log"]` is there when an episode has ended, and
-of those that have: return, steps, score, whether a fault has ended it, and the sum of each term of the reward.
+Groups of observations are a TensorDict; the runner's `obs_groups` selects the actor's and the critic's.
+`extras["time_outs"]` marks episodes truncated at the time limit. `extras["log"]` exists when episodes have ended, and has their
+return, steps, score, whether a fault ended them, and the sum of each term of the reward.
 
-rsl_rl's normaliser divides by the standard deviation plus `eps`, 0.01, which hides groups in metres: once the runner is made,
-set `obs_normalizer.eps` of actor and critic to 1e-5, as `examples/learn.py` does.
+rsl_rl's normaliser divides by the standard deviation plus `eps`, 0.01, which hides groups in metres: set `obs_normalizer.eps`
+of actor and critic to 1e-5 after constructing the runner, as `examples/learn.py` does.
 
 Shapes: `env` environments, `joint` joints that the policy moves.
 """
@@ -30,7 +30,7 @@ except ImportError as error:
 
 
 class TouchVecEnv(VecEnv):
-    """Environments of rsl_rl: a translation of a `TouchEnv`, to which it adds nothing; `cfg` is the task's document."""
+    """A `TouchEnv` with rsl_rl's interface, and nothing added; `cfg` is the task's document."""
 
     def __init__(self, touch_env: TouchEnv):
         self.touch_env, self.device = touch_env, touch_env.device
@@ -41,7 +41,7 @@ class TouchVecEnv(VecEnv):
 
     @property
     def unwrapped(self) -> TouchVecEnv:
-        """These environments: random network distillation of rsl_rl asks them for `step_dt`."""
+        """These environments: rsl_rl's random network distillation reads their `step_dt`."""
         return self
 
     @property
@@ -63,9 +63,9 @@ class TouchVecEnv(VecEnv):
         return self._obs
 
     def reset(self, seed: int | None = None) -> tuple[TensorDict, dict[str, Any]]:
-        """Begin a new episode in all environments; return the observations, and nothing else to tell.
+        """Begin a new episode in all environments; return the observations and an empty dictionary.
 
-        All that is random follows from `seed`; default: go on.
+        `seed` is the seed of all random numbers; default: continue with the current numbers.
         """
         self._obs = self._given(self.touch_env.reset(seed))
         return self._obs, {}
@@ -73,7 +73,7 @@ class TouchVecEnv(VecEnv):
     def step(
         self, actions: Float[Tensor, "env joint"]
     ) -> tuple[TensorDict, Float[Tensor, " env"], Int[Tensor, " env"], dict[str, Any]]:
-        """Make one control step with actions from −1 to 1: what is beyond is clipped.
+        """Make one control step with actions, clipped to [−1, 1].
 
         Returns:
             Observations by group, of episodes that have ended the first of the next one; rewards; 1 where an episode has ended,

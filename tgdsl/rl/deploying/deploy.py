@@ -1,4 +1,4 @@
-"""Run a policy on a source, whatever it is: observe, choose, command, at the task's control rate; and report what came of it.
+"""Run a policy on a source: observe, choose, command, at the task's control rate; and report the results.
 
 Shapes: `actuator` actuators of the scene, `joint` joints that the policy moves, `feature` numbers of a group.
 """
@@ -39,12 +39,12 @@ real one: what its gains do is not published."""
 
 @dataclass(frozen=True, eq=False)
 class HandMoment(Moment):
-    """One control step of a policy on a source; `step` is what a scene's task says of it."""
+    """One control step of a policy on a source; `step` is the result by the scene's task."""
 
     episode: int  # number of the episode, from 0
     target: Float[Tensor, "env joint"]  # set-points of the joints that it moves [rad]
-    age_s: float | None  # how old the sample was [s]; None where nothing runs in real time
-    inference_s: float  # from then until the set-points were there [s]
+    age_s: float | None  # age of the sample [s]; None where nothing runs in real time
+    inference_s: float  # time from the sample to the set-points [s]
 
 
 class DeployRecord(Record):
@@ -52,7 +52,7 @@ class DeployRecord(Record):
 
     The file holds, of each control step, its `episode` and `index` in it (step,), observations `obs:<group>` (step, feature)
     that the action was chosen from, the `action` (step, joint) from −1 to 1, the `target` (step, joint) [rad], `age` and
-    `inference` (step,) [s], and the `score` so far (step,); an age and a score that are not known are NaN. `joints` names the
+    `inference` (step,) [s], and the `score` so far (step,); unknown ages and scores are NaN. `joints` names the
     joints.
     """
 
@@ -83,7 +83,7 @@ class Quantiles(NamedTuple):
 
     @classmethod
     def of(cls, seconds: Sequence[float]) -> Quantiles | None:
-        """Return those of times [s]; None if there are none."""
+        """Return the quantiles of times [s]; None without any."""
         return cls(*(1e3 * np.quantile(seconds, (0.5, 0.99))).tolist()) if seconds else None
 
     def __str__(self) -> str:
@@ -91,7 +91,7 @@ class Quantiles(NamedTuple):
 
 
 class Scores(NamedTuple):
-    """Scores of the episodes that a scene has judged, and their mean; `held` and the intervals as `Evaluation` has them."""
+    """Scores of a scene's episodes, and their mean; `held` and the intervals as in `Evaluation`."""
 
     each: tuple[float, ...]
     mean: float
@@ -102,21 +102,21 @@ class Scores(NamedTuple):
 
 @dataclass(frozen=True)
 class Report:
-    """What came of a policy that acted."""
+    """Results of a policy on a source."""
 
-    source: str  # on what it acted, as `tgdsl.connect` takes it
+    source: str  # the source, as `tgdsl.connect` takes it
     unit: str
     episodes: int
     steps: int  # control steps of all episodes
-    scores: Scores | None  # None where no scene says what happened, as on a real hand and of a log, or no episode was whole
-    has_scene: bool  # whether a scene says what happened
-    age: Quantiles | None  # how old the sample was that an action was chosen from; None where nothing runs in real time
-    inference: Quantiles | None  # from a sample to set-points: what it took to observe and to choose
-    latency: Quantiles | None  # age and inference, of each step together; None where there is no age
-    control_rate: float  # control steps per second that the task asks for [Hz]
+    scores: Scores | None  # None without a scene, as for a real hand and a log, or without a complete episode
+    has_scene: bool  # whether a scene computes scores
+    age: Quantiles | None  # age of the sample of each action; None where nothing runs in real time
+    inference: Quantiles | None  # time from a sample to set-points: observation and choice
+    latency: Quantiles | None  # sum of age and inference of each step; None without an age
+    control_rate: float  # the task's control rate [Hz]
     rate: float  # achieved rate [Hz]
     late_steps: int  # control steps that began after they should have ended
-    moves: bool  # whether set-points went to joints
+    moves: bool  # whether joints received the set-points
 
     def __str__(self) -> str:
         count = f"{self.episodes:,} episode{'' if self.episodes == 1 else 's'}, {self.steps:,} control steps"
@@ -139,7 +139,7 @@ class Report:
 
 
 class Deployment:
-    """A policy on a source: what it takes, seen before anything is connected."""
+    """A policy on a source, validated before anything is connected."""
 
     def __init__(
         self,
@@ -158,29 +158,29 @@ class Deployment:
         progress: Progress | None = None,
         **options: Any,
     ):
-        """Read everything, and see that it fits.
+        """Read everything, and check that it fits.
 
         Args:
             task: The task's document.
             policy: The policy's file.
             source: `simulation`, `warp`, `emulator`, `xhand1:PORT`, a log, or another kind that is installed.
-            groups: Groups of observations that the policy takes, in its order; default: as its card says, or `proprio`,
-                `tactile_sensors` and `goal`, of those that there are.
-            goal: What it is asked for, in the task's units; default: what the scene's task asks for.
+            groups: Groups of observations that the policy takes, in its order; default: its card's, or the existing ones of
+                `proprio`, `tactile_sensors` and `goal`.
+            goal: The policy's goal, in the task's units; default: the goal of the scene's task.
             overrides: Values of the document to set first by dotted path.
             seed: Seed of the scene's random numbers: episode i is the first one of environment i of `tgdsl evaluate`.
             start: Keyframe whose controls a hand without a scene begins with; default: it holds the joints where they are.
-            calibration: What a hand's counts mean: see `tgdsl.connect`.
-            motion: Leave for a real hand to move, or what makes it of the scene's model; default: none. An emulated one always
-                has.
+            calibration: Calibration of a hand's counts: see `tgdsl.connect`.
+            motion: Motion limits with which a real hand may move, or a function that returns them for the scene's model;
+                default: it does not move. An emulated hand always moves.
             lockstep: Whether an emulator's scene waits for each step, and a log is read as fast as possible.
             progress: Called with a line of text for each long job.
             **options: Other options of `tgdsl.connect`.
 
         Raises:
             SpecError: All mistakes of the documents, at their places.
-            PolicyError: If the policy cannot be read, or was learned for something else.
-            DeployError: If it sees what no hand can know, or nobody says what it is asked for.
+            PolicyError: If the policy cannot be read, or was learned for another task.
+            DeployError: If it needs observations that no hand has, or a goal that nobody gives.
             TgdslError: If there is no such source.
         """
         kind = kind_of(source)
@@ -202,7 +202,7 @@ class Deployment:
         )
         asks = prepared.loaded.task.goal_units and any(name in prepared.loaded.task.hand_groups for name in prepared.groups)
         if not self.has_scene and asks and prepared.goal is None:
-            problem = f'the task "{prepared.loaded.spec.task}" draws what it asks for by what is in its scene'
+            problem = f'the task "{prepared.loaded.spec.task}" draws its goal from its scene'
             units = ", ".join(prepared.loaded.task.goal_units)
             raise DeployError(f"{policy}: {problem}, and {source} has none; say what to ask for: a goal [{units}]")
         motion = motion(prepared.model) if callable(motion) else motion
@@ -214,15 +214,15 @@ class Deployment:
         self._start_over()
 
     def _start_over(self) -> None:
-        self._times: list[tuple[float | None, float, float]] = []  # of each step: age, inference and duration [s]
-        self._episodes: list[tuple[float, bool]] = []  # of each: its score, and whether it lasted as long as one may
+        self._times: list[tuple[float | None, float, float]] = []  # age, inference and duration of each step [s]
+        self._episodes: list[tuple[float, bool]] = []  # each one's score, and whether it reached the full length
         self._late = 0
 
     def steps(self, episodes: int = 1, seconds: float | None = None) -> Iterator[HandMoment]:
         """Act, and yield each control step.
 
-        A scene's episodes end as the task says; others, and a log that is not over, after so many seconds: by default an
-        episode's, and all of a log.
+        The task ends a scene's episodes. Other episodes end after so many seconds, by default the task's duration of an
+        episode; a log also ends with its last sample, and by default only there.
         """
         if episodes < 1 or not (seconds is None or 0 < seconds < math.inf):
             raise DeployError(f"{episodes} episodes of {seconds} s, expected at least 1, and more than 0 s")
@@ -247,9 +247,9 @@ class Deployment:
                 yield from self._episode(episode, connection, policy, num_steps, None)
 
     def report(self) -> Report:
-        """Return what came of the steps that were made; raise `DeployError` if none was made."""
+        """Return the results of the steps so far; raise `DeployError` if there are none."""
         if not self._times:
-            raise DeployError(f"{self.source}: not one control step was made")
+            raise DeployError(f"{self.source}: there was no control step")
         ages, inferences, seconds = zip(*self._times, strict=True)
         prepared, num, scores = self.prepared, len(self._episodes), None
         if self.has_scene and num:
@@ -314,14 +314,14 @@ def deploy(
     watch: Callable[[HandMoment], None] | None = None,
     **options: Any,
 ) -> Report:
-    """Run a policy on a source; return what came of it.
+    """Run a policy on a source; return the results.
 
     Args:
         task: The task's document.
         policy: The policy's file.
         source: As `tgdsl.connect` takes it.
-        episodes: How many.
-        seconds: Longest duration of each [s]; default: an episode's, of a log all of it.
+        episodes: Number of episodes.
+        seconds: Longest duration of each [s]; default: the task's duration of an episode; for a log, all of it.
         watch: Called with each control step.
         **options: As for `Deployment`.
 

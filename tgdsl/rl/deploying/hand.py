@@ -1,4 +1,4 @@
-"""A source as an environment of one: observations as `TouchEnv` has them, joint targets by its arithmetic.
+"""A source as a single environment, with the observations and joint targets of a `TouchEnv`.
 
 Shapes: `env` one environment, `actuator` actuators of the scene, `joint` joints that the policy moves, `feature` numbers of a
 group.
@@ -47,12 +47,12 @@ from tgdsl.runtime.stepped_scene import SteppedScene
 from tgdsl.scene.scene import SceneModels
 
 JOINT_POS, JOINT_VEL = "joint_pos", "joint_vel"
-"""Groups of the module that proprioception is made of: all actuated joints, in the order of the actuators."""
-EMULATED = "agg_force"  # what an emulated hand's fingertips feel, whatever a policy makes of it
+"""The module's groups for proprioception: all actuated joints, in the order of the actuators."""
+EMULATED = "agg_force"  # touch of an emulated hand's fingertips, whatever a policy computes from it
 CARD_KEYS = ("sensors", "touch", "placement", "resolution", "noise", "temporal", "joint_vel")
-"""What of a task's document is as it was where the policy was learned."""
+"""Keys of a task's document that the policy's card overrides."""
 EVERYONE = torch.ones(1, dtype=torch.bool)
-APPROACH_S = 2.0  # time in which a hand that may move goes to the keyframe from which it shall act [s]
+APPROACH_S = 2.0  # time in which a hand that may move approaches the start keyframe [s]
 
 
 class DeployError(TgdslError):
@@ -61,17 +61,17 @@ class DeployError(TgdslError):
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A policy with all that is needed to connect it."""
+    """A policy with all that a connection needs."""
 
     saved: PolicyFile
-    loaded: LoadedTask  # the task's document, with what the policy feels and is asked for
-    sensed: Sensed  # its module: what the policy feels and the task looks at, and the joints
-    felt: Felt | None  # what the policy feels; None: nothing
+    loaded: LoadedTask  # the task's document, with the policy's touch and goal
+    sensed: Sensed  # its module: the sensors of policy and task, and the joints
+    felt: Felt | None  # the policy's touch; None without touch
     groups: Mapping[str, int]  # groups of observations that it takes, in its order, with their sizes
-    goal: tuple[float, ...] | None  # what a user asks for; None: what the scene's task does
+    goal: tuple[float, ...] | None  # the user's goal; None: the goal of the scene's task
     model: mujoco.MjModel
     moved: Actuators  # the joints that the policy moves
-    changes: Sequence[str]  # what of the task was otherwise when the policy was learned, a line each
+    changes: Sequence[str]  # changes of the task since the policy was learned, a line each
 
     @property
     def control_step(self) -> float:
@@ -95,10 +95,10 @@ def prepare(
     is_emulated: bool = False,
     progress: Progress | None = None,
 ) -> Prepared:
-    """Read a task's document and a policy, and compile the module with which the policy feels.
+    """Read a task's document and a policy, and compile the module of the policy's touch.
 
-    What it feels, where, how densely and with what noise stand in its card; the document's `touch`, `placement`, `resolution`
-    and `noise` count for a policy without one. An emulated hand has to feel what the fingertips would. For the other arguments
+    The policy's card sets type, placement, resolution and noise of its touch; the document's `touch`, `placement`, `resolution`
+    and `noise` apply to a policy without a card. An emulated hand also computes the fingertips' touch. For the other arguments
     see `Deployment`.
     """
     loaded, saved = load_task(task, overrides), read_policy(policy)
@@ -110,9 +110,9 @@ def prepare(
         loaded = replace(loaded, spec=loaded.spec.model_copy(update=from_card))
         changes += changes_since(card, loaded.spec)
     of_hand = loaded.task.hand_groups
-    known = ("proprio", *([GROUP] if loaded.spec.touch != "none" else []), *of_hand)
-    names = tuple(groups) or tuple(card["groups"] if card else [name for name in ACTOR_GROUPS if name in known])
-    if unknown := [name for name in names if name not in (*known, GROUP)]:
+    known_groups = ("proprio", *([GROUP] if loaded.spec.touch != "none" else []), *of_hand)
+    names = tuple(groups) or tuple(card["groups"] if card else [name for name in ACTOR_GROUPS if name in known_groups])
+    if unknown := [name for name in names if name not in (*known_groups, GROUP)]:
         problem = f'this policy sees {listed(unknown)} of the task "{loaded.spec.task}", which only a scene knows'
         hint = f"on a hand there are {listed(['proprio', GROUP, *of_hand])}"
         raise DeployError(f"{policy}: {problem}; {hint}; teach a student that sees no more: tgdsl distill")
@@ -148,7 +148,7 @@ def prepare(
 
 
 def _with_goal(loaded: LoadedTask, goal: tuple[float, ...]) -> LoadedTask:
-    """Return the document in which a user's goal is asked for."""
+    """Return the document with a user's goal."""
     units = loaded.task.goal_units
     if len(goal) != len(units):
         expected = f"expected {len(units)} [{', '.join(units)}]" if units else "and nothing can be asked for"
@@ -160,20 +160,20 @@ def _with_goal(loaded: LoadedTask, goal: tuple[float, ...]) -> LoadedTask:
 
 
 def empty_step(score: float = math.nan) -> Step:
-    """Return a step of one environment that brings nothing and ends nothing."""
+    """Return a step of one environment without observations, reward or end."""
     false, count, zero = torch.zeros(1, dtype=torch.bool), torch.zeros(1, dtype=torch.int64), torch.zeros(1)
     return Step({}, zero, false, false, StepInfo(false, {}, {}, zero + score, zero, count, {}, false))
 
 
 class TaskScene(SteppedScene):
-    """One environment of a task: its objects, pushes and drives are simulated, and the task judges what happens.
+    """One environment of a task: its objects, pushes and drives are simulated, and the task computes rewards and ends.
 
-    An episode that is over stands still until it is reset. `goal` is what the task asks for now, `last_step` what it says
-    of the instant that the readings are of.
+    A finished episode stands still until it is reset. `goal` is the task's present goal, `last_step` the result at the instant
+    of the readings.
     """
 
     def __init__(self, env: TouchEnv):
-        """Take environments of one, at the start of an episode; they are closed with the scene."""
+        """Take a single environment at the start of an episode; it is closed with the scene."""
         self._env = env
         super().__init__(env.touch, env.sim)
         self.max_steps = env.max_steps
@@ -181,7 +181,7 @@ class TaskScene(SteppedScene):
 
     @property
     def start(self) -> Float[Tensor, " actuator"]:
-        """Set-points at the start of an episode, or as `put` has changed them since [rad]: a copy."""
+        """Set-points at the start of an episode, with later changes by `put` [rad]: a copy."""
         return self._setpoints[0].cpu().clone()
 
     def put(self, actuators: Int[np.ndarray, " n"], setpoints: Float[np.ndarray, " n"]) -> None:
@@ -215,14 +215,14 @@ class TaskScene(SteppedScene):
 class Hand:
     """One episode on a source.
 
-    Targets are those of an `Actuation` whose drives are ideal: what a real drive does with them is the hand's affair.
+    An `Actuation` with ideal drives computes the targets; the hand's real drives follow them.
 
-    `age_s` is how old the sample was of which the last observations were made, None where nothing runs in real time,
-    `inference_s` the time from then until the set-points were there, `seconds` what the last control step took [s].
+    `age_s` is the age of the last observations' sample, None where nothing runs in real time, `inference_s` the time from
+    there to the set-points, `seconds` the duration of the last control step [s].
     """
 
     def __init__(self, prepared: Prepared, connection: Connection, scene: TaskScene | None, is_exact: bool):
-        """Begin with all targets at zero; if exact, the source's velocities are a simulation's, and not measured."""
+        """Begin with all targets at zero; `is_exact`: the source's velocities are exact, from a simulation."""
         self._prepared, self._connection, self._scene = prepared, connection, scene
         model, spec = prepared.model, prepared.loaded.spec
         sizes = {"qpos": model.nq, "qvel": model.nv, "ctrl": model.nu, "qfrc_applied": model.nv}
@@ -234,7 +234,7 @@ class Hand:
         self._measures = is_exact and spec.joint_vel == "measured"
         self._speeds: groups.MeasuredVelocity | None = None
         self._began = 0.0
-        self.action = torch.zeros((1, len(self._rows)), dtype=torch.float64)  # the last one, from −1 to 1
+        self.action = torch.zeros((1, len(self._rows)), dtype=torch.float64)  # last action, from −1 to 1
         self.steps = 0
         self.age_s: float | None = None
         self.inference_s = self.seconds = 0.0
@@ -245,7 +245,7 @@ class Hand:
         return self._actuation.target.clone()
 
     def begin(self, start: Float[np.ndarray, " actuator"] | None, moves: bool) -> None:
-        """Begin where the scene is; without one at set-points [rad], to which a hand that moves goes first, or where it is."""
+        """Begin at the scene's start; without a scene, at set-points [rad] after an approach, or at the present positions."""
         if self._scene is not None:
             control = self._scene.start
         elif start is None:
@@ -285,7 +285,7 @@ class Hand:
         return {name: result[name].float() for name in prepared.groups}
 
     def step(self, action: Float[Tensor, "env joint"]) -> Step:
-        """Make one control step; joints that the policy does not move are held. Without a scene its score is not a number."""
+        """Make one control step; joints that the policy does not move are held. Without a scene the score is NaN."""
         action = action.to(self.action)
         if not bool(action.isfinite().all()):
             problem = f"at control step {self.steps} this policy returns {action[0].tolist()}, expected finite actions"

@@ -1,1 +1,1 @@
-"""Grasps that episodes begin from: sampled in simulation beforehand, kept in the user's cache, drawn at each reset."""
+"""Initial grasps of episodes: sampled in simulation, cached, drawn at each reset."""

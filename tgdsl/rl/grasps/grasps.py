@@ -1,4 +1,4 @@
-"""Grasps as they are kept: in a file, or in the user's cache under a hash of all that they follow from.
+"""Stored grasps: in a file, or in the user's cache under a hash of scene and settings.
 
 Shapes: `grasp` grasps, `nq` and `nu` as in MuJoCo's model.
 """
@@ -33,47 +33,47 @@ NonNegativeForce = Annotated[float, Quantity("force", ge=0.0)]
 
 
 class GraspSpec(SpecModel):
-    """How grasps are sampled, and which of them are kept: see `tgdsl.rl.grasps.sampling`."""
+    """Sampling and acceptance of grasps: see `tgdsl.rl.grasps.sampling`."""
 
     closed: str = "closed"
-    """The scene's keyframe to whose controls the joints that the policy moves close; they start near the task's keyframe."""
+    """The scene's keyframe with the controls of the closed hand; the policy's joints start near the task's keyframe."""
     file: str | None = None
     """A file that `tgdsl grasps --out` wrote, relative to this document; default: the user's cache, sampled if it has none."""
     num: Whole = 512
-    """How many are kept, as many of each variant of the object."""
+    """Number of grasps, divided equally among the object's variants."""
     seed: Annotated[StrictInt, Field(ge=0)] = 0
-    """What all that is random follows from."""
+    """Seed of all random numbers."""
     spread: NonNegativeAngle = 0.2
-    """How far joints start from the keyframe, and how far from the closed hand's controls they are told to go, at most [rad];
-    but no more than a quarter of a joint's range."""
+    """Largest offset of joints from the keyframe at the start, and of their targets from the closed hand's controls [rad];
+    at most a quarter of a joint's range."""
     squeeze: Annotated[Range, RangeOf("angle", gt=0.0)] = (0.05, 0.2)
-    """How far a joint's target may lead its position: what it presses with, over the gain of its servo [rad]."""
+    """Largest lead of a joint's target over its position: the pressing torque over the servo's gain [rad]."""
     yaw: Annotated[Range, RangeOf("angle")] = ZERO
-    """By how much the object is turned about the vertical; it needs a free or ball joint [rad]."""
+    """Rotation of the object about the vertical; it needs a free or ball joint [rad]."""
     offset: Annotated[Range, RangeOf("length")] = ZERO
-    """What is added to the object's place along each of the world's axes; it needs a free joint [m]."""
+    """Offset of the object along each of the world's axes; it needs a free joint [m]."""
     close: Time = 0.8
-    """For how long the hand closes, while the object is held where it is [s]."""
+    """Time in which the hand closes while the object is fixed [s]."""
     settle: Time = 0.6
-    """For how long the hand then has the object to itself, until it is kept [s]."""
+    """Time from the release of the object to the grasp [s]."""
     hold: Time = 1.2
-    """For how long it is pushed afterwards, to see whether the hand holds it [s]."""
+    """Time of the pushes that test the grasp [s]."""
     push: NonNegativeForce = 1.0
-    """Force of the pushes, each in a direction of its own and for a quarter of `hold` [N]."""
+    """Force of the pushes, each in a random direction and for a quarter of `hold` [N]."""
     max_tilt: Angle = 0.1
-    """By how much the object may then be tilted from where it was held [rad]."""
+    """Largest tilt of the object from its fixed pose [rad]."""
     max_shift: PositiveLength = 0.01
-    """How far it may be from there [m]."""
+    """Largest distance of the object from its fixed pose [m]."""
     min_links: Whole = 2
-    """On how many links it must press with `min_force`."""
+    """Least number of links that press with `min_force`."""
     min_force: Annotated[float, Quantity("force", gt=0.0)] = 0.1
-    """Force with which a link counts [N]."""
+    """Least force of a pressing link [N]."""
     opposite: Angle = 2.0
     """Least angle between two such forces, so that links press from opposite sides [rad]."""
 
 
 def grasp_spec(spec: TaskSpec) -> GraspSpec | None:
-    """Return how a task's grasps are sampled; None if its episodes do not begin with grasps."""
+    """Return the settings of a task's grasps; None if its episodes do not begin with grasps."""
     result = getattr(spec, "grasps", None)
     return result if isinstance(result, GraspSpec) else None
 
@@ -87,10 +87,10 @@ class Grasps:
 
     qpos: Float[np.ndarray, "grasp nq"]  # positions of all joints
     ctrl: Float[np.ndarray, "grasp nu"]  # controls of all actuators, with which the hand presses
-    variant: Int[np.ndarray, " grasp"]  # which of the object's variants each holds
+    variant: Int[np.ndarray, " grasp"]  # variant of each one's object
     scene: str  # digest of the scene: see `tgdsl.scene.digest`
     object: str  # the document's name of the object
-    settings: str  # how they were sampled, as JSON
+    settings: str  # settings of the sampling, as JSON
 
     def __len__(self) -> int:
         return len(self.qpos)
@@ -103,7 +103,7 @@ class Grasps:
 
     @classmethod
     def unpacked(cls, arrays: Mapping[str, np.ndarray]) -> Grasps:
-        """Return what `packed` has made arrays of."""
+        """Return grasps from the arrays of `packed`."""
         if str(arrays["format"]) != FORMAT:
             raise ValueError(f"format {arrays['format']}")
         return cls(
@@ -112,7 +112,7 @@ class Grasps:
 
 
 def settings_of(spec: TaskSpec, joints: tuple[str, ...]) -> str:
-    """Return all that grasps follow from besides the scene, as JSON."""
+    """Return all settings that affect grasps, without the scene, as JSON."""
     grasps = grasp_spec(spec)
     assert grasps is not None
     physics = {"options": spec.physics.options, "substeps": spec.physics.substeps}
@@ -126,7 +126,7 @@ def cache_key(scene: str, settings: str) -> str:
 
 
 def write_grasps(grasps: Grasps, file: Path) -> None:
-    """Write grasps to a file; one that is there is replaced."""
+    """Write grasps to a file; an existing one is replaced."""
     with atomic_open(with_folder(file)) as out:
         np.savez(out, allow_pickle=False, **grasps.packed())
 
@@ -158,20 +158,20 @@ class Drawn(NamedTuple):
 
 
 class GraspTable:
-    """Grasps as environments draw them: each those of its own variant of the object, ordered by variant."""
+    """Grasps for environments, ordered by variant: each environment draws from its variant's."""
 
     qpos: Float[Tensor, "grasp nq"]
     ctrl: Float[Tensor, "grasp nu"]  # controls of all actuators, with which the hand presses
-    contacts: dict[str, Tensor]  # fields of a state that follow from forces, by name, (grasp, …): those that the module wants
+    contacts: dict[str, Tensor]  # contact and force fields of a state that the module reads, by name, (grasp, …)
     pos: Float[Tensor, "grasp 3"]  # position of the object's body in each, in the world [m]
     quat: Float[Tensor, "grasp 4"]  # its orientation, w, x, y, z
     first: Int[Tensor, " env"]  # the first grasp of each environment's variant
-    count: Int[Tensor, " env"]  # how many that variant has
+    count: Int[Tensor, " env"]  # number of that variant's grasps
 
     def __init__(self, grasps: Grasps, sim: Simulation, body: str, variant: Int[Tensor, " env"], draws: Draws):
-        """Evaluate the contacts of all grasps, in the simulation; it has to be reset afterwards.
+        """Evaluate the contacts of all grasps in the simulation, which the caller must reset afterwards.
 
-        Its objects have to be as those that the grasps were sampled with, and not yet of a mass and friction of their own.
+        Objects must be the ones of the sampling, before masses and friction are randomised.
         """
         shape = (sim.model.nq, sim.model.nu)
         sizes = (grasps.qpos.shape[1], grasps.ctrl.shape[1])
@@ -200,7 +200,7 @@ class GraspTable:
         return Drawn({"qpos": self.qpos[index], "ctrl": self.ctrl[index]}, contacts, self.pos[index], self.quat[index])
 
     def _evaluated(self, sim: Simulation, body: str, variants: Int[np.ndarray, " env"]) -> dict[str, Tensor]:
-        """Return the touch in each grasp, and the object's place: zeros for variants that no environment has."""
+        """Return the contact fields and the object's pose in each grasp; zeros for variants without an environment."""
         rank, num = np.zeros_like(variants), np.zeros_like(variants)
         for v in np.unique(variants):
             rank[variants == v], num[variants == v] = np.arange((variants == v).sum()), (variants == v).sum()

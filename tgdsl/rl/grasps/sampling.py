@@ -1,17 +1,17 @@
-"""Sampling of grasps: a hand closes on an object at random, again and again, and what holds is kept.
+"""Sampling of grasps: a hand closes on an object at random, and stable grasps are stored.
 
-One trial, in simulation, nothing of the object's mass, friction or the drives being random:
+One trial, in simulation, without randomised mass, friction or drives:
 
-1. Joints start near the task's keyframe, by `spread` or a quarter of their range, the object is turned and moved at random and
-   held there.
-2. For `close` the joints that the policy moves go, each in a time of its own, from where they are to near the controls of the
-   keyframe `closed`; but a target never leads its joint by more than the trial's `squeeze`, so that a finger that has met the
-   object presses with that times its servo's gain. The other joints have the keyframe's controls.
-3. The object is let go. After `settle` its velocity and the hand's are set to zero: this is the grasp.
-4. For `hold` the object is pushed, in four random directions one after the other.
+1. Joints start near the task's keyframe, by `spread` or a quarter of their range; the object is turned and moved at random and
+   fixed there.
+2. For `close` the policy's joints move to near the controls of the keyframe `closed`, each in a random time. A target never
+   leads its joint by more than the trial's `squeeze`, so a finger in contact presses with that times its servo's gain. The
+   other joints have the keyframe's controls.
+3. The object is released. After `settle` all velocities are set to zero: this is the grasp.
+4. For `hold` the object is pushed in four random directions, one after the other.
 
-A grasp is kept where the object is near where it was held, both at the end of 3. and of 4., and links press on it from opposite
-sides. All is counted, not drawn: trials are the same on every computer of one kind, however many threads it has.
+A grasp is stored if the object is near its fixed pose at the end of both 3. and 4., and links press on it from opposite sides.
+Random numbers are counter-based: trials are the same on every computer of one kind, with any number of threads.
 
 Shapes: `env` environments, trials side by side, `joint` joints that the policy moves, `link` links, `nq` and `nu` as in
 MuJoCo's model.
@@ -46,11 +46,11 @@ from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.scene.scene import scene_digest
 from tgdsl.schema.yaml import Path
 
-SIDE_BY_SIDE = 256  # most trials at once; of a few grasps there are twice as many
+SIDE_BY_SIDE = 256  # most parallel trials; for few grasps twice their number
 PUSHES = 4  # pushes of each trial
-SHARE = 0.25  # most that `spread` may be, as a share of a joint's range, so that few grasps begin at a joint's limit
-LEAST_SHARE, ENOUGH = 0.01, 1000  # share of trials that must be kept of a variant, once so many were made
-Count = Callable[[int, int], None]  # called with the number of grasps so far and the number wanted
+SHARE = 0.25  # upper bound of `spread` as a share of a joint's range, so that few grasps begin at a joint's limit
+LEAST_SHARE, ENOUGH = 0.01, 1000  # least share of a variant's trials that must hold, from this number of trials on
+Count = Callable[[int, int], None]  # called with the number of grasps so far and the number requested
 
 
 def sample(loaded: LoadedTask, count: Count, progress: Progress | None = None) -> Grasps:
@@ -59,21 +59,21 @@ def sample(loaded: LoadedTask, count: Count, progress: Progress | None = None) -
     assert spec is not None
     trials = _Trials(loaded, sensed, spec)
     num = trials.num_variants
-    wanted = torch.tensor([spec.num // num + (v < spec.num % num) for v in range(num)])
-    kept, rounds, trials_of = torch.zeros_like(wanted), [], torch.bincount(trials.variant)
-    while not rounds or bool((kept < wanted).any()):
+    requested = torch.tensor([spec.num // num + (v < spec.num % num) for v in range(num)])
+    accepted, rounds, trials_of = torch.zeros_like(requested), [], torch.bincount(trials.variant)
+    while not rounds or bool((accepted < requested).any()):
         rounds.append(trials.run(len(rounds)))
-        kept += torch.bincount(rounds[-1][0], minlength=num)
+        accepted += torch.bincount(rounds[-1][0], minlength=num)
         for v, tried in enumerate((len(rounds) * trials_of).tolist()):
-            if kept[v] < min(int(wanted[v]), LEAST_SHARE * tried) and tried >= ENOUGH:
+            if accepted[v] < min(int(requested[v]), LEAST_SHARE * tried) and tried >= ENOUGH:
                 problem = (
-                    f"only {int(kept[v])} of {tried} grasps of variant {v} of {loaded.spec.object} hold: {trials.failures}"
+                    f"only {int(accepted[v])} of {tried} grasps of variant {v} of {loaded.spec.object} hold: {trials.failures}"
                 )
                 raise loaded.error(("grasps",), problem, "start the hand nearer to the object, or ask for less")
-        count(int(torch.minimum(kept, wanted).sum()), spec.num)
+        count(int(torch.minimum(accepted, requested).sum()), spec.num)
     trials.sim.close()
     variant, qpos, ctrl = (torch.cat(parts) for parts in zip(*rounds, strict=True))
-    ids = torch.cat([torch.nonzero(variant == v).flatten()[: int(wanted[v])] for v in range(num)])
+    ids = torch.cat([torch.nonzero(variant == v).flatten()[: int(requested[v])] for v in range(num)])
     return Grasps(
         qpos=qpos[ids].numpy(),
         ctrl=ctrl[ids].numpy(),
@@ -169,7 +169,7 @@ class _Trials:
             self.sim.step()
 
     def _push(self, count: Int[Tensor, " env"]) -> None:
-        """Push the objects, and have them rest for a while after each push."""
+        """Push the objects, with a pause after each push."""
         sim, body = self.sim, int(self.sim.model.body(self._body).id)
         applied = sim.arrays["xfrc_applied"]
         for i in range(PUSHES):
@@ -186,7 +186,7 @@ class _Trials:
     def _strayed(
         self, begin_pos: Float[Tensor, "env 3"], begin_quat: Float[Tensor, "env 4"]
     ) -> tuple[Bool[Tensor, " env"], Bool[Tensor, " env"]]:
-        """Return which objects are tilted, and which are elsewhere."""
+        """Return which objects are tilted, and which have moved away."""
         pos, quat = self._object()
         up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(pos)
         tilt = rotations.swing(rotations.product(quat, rotations.inverse(begin_quat)), up)
@@ -207,10 +207,10 @@ class _Trials:
 
 
 class _Place:
-    """Where an object is held while the hand closes."""
+    """The object's fixed pose while the hand closes."""
 
     def __init__(self, loaded: LoadedTask, spec: GraspSpec, model: mujoco.MjModel, body: str):
-        """Look up its joints; raise `SpecError` if it has none, or none that can turn or move it as asked."""
+        """Look up its joints; raise `SpecError` if it has none, or none for `yaw` or `offset`."""
         mj_body = model.body(body)
         self._yaw, self._offset = spec.yaw, spec.offset
         joints = range(int(mj_body.jntadr[0]), int(mj_body.jntadr[0]) + int(mj_body.jntnum[0]))
@@ -245,7 +245,7 @@ class _Place:
 
 
 def with_grasps(setup: Setup, loaded: LoadedTask, sim: Simulation, scene: SceneFile, progress: Progress | None = None) -> Setup:
-    """Return a setup with the grasps of its document, if it has any; the simulation has to be reset afterwards."""
+    """Return a setup with the grasps of its document, if it has any; reset the simulation afterwards."""
     spec, tell = grasp_spec(loaded.spec), progress or silent
     if spec is None:
         return setup
@@ -263,6 +263,6 @@ def with_grasps(setup: Setup, loaded: LoadedTask, sim: Simulation, scene: SceneF
 def cached_grasps(
     loaded: LoadedTask, scene: SceneFile, joints: tuple[str, ...], count: Count, progress: Progress | None = None
 ) -> Grasps:
-    """Return the task's grasps from the user's cache, under a hash of scene and settings; sample them if it has none."""
+    """Return the task's grasps from the user's cache, under a hash of scene and settings; sample them if missing."""
     key = cache_key(scene_digest(scene), settings_of(loaded.spec, joints))
     return cached(key, lambda: sample(loaded, count, progress), Grasps.packed, Grasps.unpacked)

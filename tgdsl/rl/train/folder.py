@@ -112,10 +112,10 @@ class RunFolder:
         rows = list[dict[str, str]]()
         for row in lines:
             if None in row or None in row.values() or not row.get("iteration", "").isdecimal():
-                found = complete.splitlines()[lines.line_num - 1]
+                line = complete.splitlines()[lines.line_num - 1]
                 expected = f"a value for each of {', '.join(lines.fieldnames or ())}"
                 hint = "move this file away, and the run goes on with a new one"
-                raise TgdslError(f"{self.curve}:{lines.line_num}: found {found!r}, expected {expected}; {hint}")
+                raise TgdslError(f"{self.curve}:{lines.line_num}: found {line!r}, expected {expected}; {hint}")
             rows.append(row)
         return rows
 
@@ -151,11 +151,11 @@ class RunFolder:
 
 
 class CheckpointError(TgdslError):
-    """A checkpoint that cannot be read, or that is of something else."""
+    """A checkpoint that cannot be read, or that does not fit."""
 
 
 def write_checkpoint(state: Mapping[str, Any], file: Path) -> None:
-    """Write a checkpoint to the disk: it replaces the file that is there whole, or not at all."""
+    """Write a checkpoint to the disk, replacing an existing file atomically."""
     content = io.BytesIO()
     torch.save(dict(state), content)
     with atomic_open(file) as opened:
@@ -165,26 +165,26 @@ def write_checkpoint(state: Mapping[str, Any], file: Path) -> None:
 
 
 def read_checkpoint(file: Path) -> dict[str, Any]:
-    """Return what a checkpoint holds, on the CPU."""
+    """Return a checkpoint's state, on the CPU."""
     if not file.is_file():
         raise CheckpointError(f"{file}: there is no checkpoint")
-    what = "a file of something else"
+    text = "a file of something else"
     try:
         content = io.BytesIO(file.read_bytes())
         state = torch.load(content, map_location="cpu", weights_only=True)
         if isinstance(state, dict) and state.get("format") == FORMAT:
             return state
         if isinstance(state, dict) and "format" in state:
-            what = f"a checkpoint of format {state['format']}, not {FORMAT}, of another version of tgdsl"
+            text = f"a checkpoint of format {state['format']}, not {FORMAT}, of another version of tgdsl"
         cause = None
     except OSError as error:
         raise CheckpointError(f"{file}: cannot read this file: {error.strerror or error}") from error
     except Exception as error:  # whatever torch and pickle raise
         if not zipfile.is_zipfile(content):
-            what = f"{file.stat().st_size:,} bytes that are cut off, or of something else"
+            text = f"{file.stat().st_size:,} bytes that are cut off, or of something else"
         cause = error
     hint = "put back a copy of one, or begin again with another --out"
-    raise CheckpointError(f"{file}: found {what}, expected a checkpoint of `tgdsl train` or `tgdsl distill`; {hint}") from cause
+    raise CheckpointError(f"{file}: found {text}, expected a checkpoint of `tgdsl train` or `tgdsl distill`; {hint}") from cause
 
 
 def documents(loaded: LoadedTask) -> dict[str, Path]:
@@ -222,7 +222,7 @@ def run_origin(loaded: LoadedTask, env: TouchEnv, seed: int, overrides: Mapping[
 
 
 def _module_digest(plan: Plan) -> str:
-    """Return a hash of what is compiled, wherever its files are."""
+    """Return a hash of the compiled module, independent of its files' paths."""
     scene = replace(plan.scene, assets=tuple(replace(asset, path="") for asset in plan.scene.assets))
     plan = replace(plan, origin=replace(plan.origin, robot=""), scene=scene)
     return hashlib.sha256(plan.to_json().encode()).hexdigest()
@@ -232,7 +232,7 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any], model: type[TaskS
     """Return the differences between the origins of two starts, a line each: the task's numbers, its seed, its sensors."""
     lines = spec_differences(before["spec"], now["spec"], model)
     lines += [line for name in ("seed", "envs") for line in differences(before[name], now[name], name)]
-    descriptions = {"module": "what is compiled of the sensors' document", "taxels": "the table of taxels"}
+    descriptions = {"module": "the compiled module of the sensors' document", "taxels": "the table of taxels"}
     return lines + [description for name, description in descriptions.items() if before[name] != now[name]]
 
 

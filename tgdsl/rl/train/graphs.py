@@ -1,4 +1,4 @@
-"""Work on the same tensors that is done again and again: on a GPU it is captured as a CUDA graph at its third call."""
+"""Repeated work on the same tensors: on a GPU it is captured as a CUDA graph at its third call."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Generic, TypeVar
 import torch
 
 T = TypeVar("T")
-EAGER_CALLS = 2  # calls before the one that is captured: they load kernels, and make what lasts
+EAGER_CALLS = 2  # calls before the captured one: they load kernels and allocate persistent tensors
 
 
 class Captured(Generic[T]):
     """A function without arguments that reads and writes the same tensors at each call; on a CPU just that function.
 
-    Each call does the work once: the first two as it stands, on the stream on which the third is captured, so that libraries
-    have their workspaces there; from the third on the graph is replayed. What it returns is in the same tensors from then on.
+    Each call does the work once: the first two calls run eagerly on the stream of the later capture, so that libraries have
+    their workspaces there; from the third on the graph is replayed. Its outputs are then always the same tensors.
     """
 
     def __init__(self, body: Callable[[], T], device: torch.device | str, has_tf32: bool = False, is_captured: bool = True):
@@ -26,7 +26,7 @@ class Captured(Generic[T]):
         self.forget()
 
     def forget(self) -> None:
-        """Capture again: tensors lie elsewhere."""
+        """Discard the graph, as tensors have moved; the work is captured again."""
         self._calls = 0
         self._graph: torch.cuda.CUDAGraph | None = None
         self._made: T | None = None
@@ -53,7 +53,7 @@ class Captured(Generic[T]):
         return outputs
 
     def _capture(self, stream: torch.cuda.Stream) -> tuple[torch.cuda.CUDAGraph, T]:
-        """Capture the work without doing it; nothing may be collected meanwhile: what Warp frees breaks it."""
+        """Capture the work without doing it; garbage collection is off, as Warp's deallocations break a capture."""
         graph = torch.cuda.CUDAGraph()
         gc.collect()
         was_enabled = gc.isenabled()
@@ -72,9 +72,9 @@ class Captured(Generic[T]):
 
 
 class SideBySide:
-    """Works that neither read nor write what another one writes: on a GPU each on a stream of its own, on a CPU in turn.
+    """Independent works: on a GPU each on a separate stream, on a CPU in turn.
 
-    Small kernels of one leave room for those of others. Within a `Captured` function they are parallel branches of its graph.
+    On a GPU their small kernels overlap. Within a `Captured` function they are parallel branches of its graph.
     """
 
     def __init__(self, count: int, device: torch.device | str):
@@ -82,7 +82,7 @@ class SideBySide:
         self._streams = [torch.cuda.Stream(device) for _ in range(count)] if is_cuda else None
 
     def __call__(self, works: Sequence[Callable[[], T]]) -> list[T]:
-        """Do them; return what each returns. What is enqueued after them waits for all."""
+        """Run the works and return their results; work enqueued afterwards waits for all of them."""
         if self._streams is None:
             return [work() for work in works]
         outputs, current = [], torch.cuda.current_stream(self._streams[0].device)
@@ -97,7 +97,7 @@ class SideBySide:
 
 @contextlib.contextmanager
 def _matmul(has_tf32: bool) -> Iterator[None]:
-    """Multiply matrices in TF32 or in float32, and as before afterwards."""
+    """Multiply matrices in TF32 or in float32; restore the setting afterwards."""
     precision = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high" if has_tf32 else "highest")
     try:

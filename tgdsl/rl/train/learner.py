@@ -85,13 +85,13 @@ class Iteration:
 
 
 class Learning(Actor):
-    """Environments and who learns in them, iteration by iteration: a rollout in which it acts, and an update.
+    """Environments and a learner in them, iteration by iteration: a rollout in which it acts, and an update.
 
-    On a GPU the host waits once per iteration, but for captures at the first ones. `groups` are the groups of observations of
-    each network, `samples` the control steps so far, over all processes and environments.
+    On a GPU the host waits once per iteration, except for captures in the first ones. `groups` are the groups of observations
+    of each network, `samples` the control steps so far, over all processes and environments.
     """
 
-    rates: ClassVar[str]  # what of the document makes smaller steps
+    rates: ClassVar[str]  # keys of the document that make smaller steps
     groups: dict[str, list[str]]
     std: list[float] | None = None  # standard deviation of its actions
     on_step: Callable[[Moment], None] | None = None  # called after each control step
@@ -107,7 +107,7 @@ class Learning(Actor):
         return self._tally.names
 
     def iterate(self, share: float = 0.0) -> Iteration:
-        """Make a rollout, and learn from it; `share` is how much of the run is over, 0 to 1."""
+        """Make a rollout, and learn from it; `share` is the finished share of the run, 0 to 1."""
         self.set_rate(share)
         self.roll()
         start, middle = self._roll_start, self._mark()
@@ -125,7 +125,7 @@ class Learning(Actor):
         return Iteration(round(values[0]), self._tally.means(values[: len(sums)]) | metrics, *durations)
 
     def set_rate(self, share: float) -> None:
-        """Set the learning rate for a share of the run that is over; by default it stays."""
+        """Set the learning rate for the finished share of the run; by default it is constant."""
 
     def roll(self) -> None:
         """Make a rollout."""
@@ -153,7 +153,7 @@ class Learning(Actor):
         self.go_on_here()
 
     def go_on_here(self) -> None:
-        """Go on from where the environments are, with an empty memory of their episodes."""
+        """Continue from the environments' present state, with an empty memory of their episodes."""
         self._has_begun = True
         self.begin(torch.ones(self.env.num_envs, dtype=torch.bool, device=self.env.device))
 
@@ -175,14 +175,14 @@ class Learning(Actor):
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """Return what is learned, and what learning goes on from."""
+        """Return the learned state, and all that resuming needs."""
 
     @abstractmethod
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what was saved; it may hold more than `state_dict` returned."""
+        """Resume from a saved state; it may hold more than `state_dict` returned."""
 
     def _mark(self) -> Any:
-        """Return the time; on a GPU as an event, which nobody waits for."""
+        """Return the time; on a GPU as an event, without synchronising."""
         if self.env.device.type != "cuda":
             return time.perf_counter()
         event = torch.cuda.Event(enable_timing=True)
@@ -194,7 +194,7 @@ class Learning(Actor):
 
     @abstractmethod
     def _keep(self, moment: Moment) -> None:
-        """Keep a control step of the rollout."""
+        """Store a control step of the rollout."""
 
     @abstractmethod
     def _update(self) -> None:
@@ -202,11 +202,11 @@ class Learning(Actor):
 
     @abstractmethod
     def _numbers(self) -> dict[str, Tensor]:
-        """Return the learner's numbers of the iteration, on the device; a score of no episode is not a number."""
+        """Return the learner's numbers of the iteration, on the device; a score without episodes is NaN."""
 
 
 PROPRIO, PRIVILEGED, STATE, PROPS = "proprio", "priv_proprio", "priv_obj_state", "priv_obj_props"
-"""What is known of the hand; that and its forces; the object's motion; what it is like."""
+"""Groups of the hand's joints; of joints and forces; of the object's motion; of its properties."""
 MOST_STD = 1e6  # bound above of the actions' standard deviation: rsl_rl's
 
 PPO_OPTIONS = {
@@ -253,7 +253,7 @@ def config(loaded: LoadedTask, groups: Mapping[str, int], multi_gpu: Mapping[str
         "encoders": {name: {"hidden": list(spec.hidden), "size": spec.size} for name, spec in encoders.items()},
     }
     gaussian = {"class_name": "tgdsl.rl.train.model:Gaussian", "init_std": networks.initial_std}
-    algorithm = {name: getattr(train, own) for name, own in PPO_OPTIONS.items()}
+    algorithm = {name: getattr(train, key) for name, key in PPO_OPTIONS.items()}
     algorithm |= {"class_name": "tgdsl.rl.train.ppo:CapturedPPO", "schedule": "adaptive" if train.adaptive else "fixed"}
     rnd = None
     if train.rnd != "off":
@@ -305,7 +305,7 @@ class Learner(Learning):
         return self.algorithm.act(self._seen(obs))
 
     def iterate(self, share: float = 0.0) -> Iteration:
-        """Make a rollout, and learn from it; `share` changes nothing: the rate adapts to the policy, or stays."""
+        """Make a rollout, and learn from it; `share` has no effect: the rate adapts to the policy, or is constant."""
         self.env.curricula.advance(self.iteration, self._score)
         result = super().iterate(share)
         self._score = result.metrics.get("Episode/score", self._score)
@@ -317,7 +317,7 @@ class Learner(Learning):
         return {"algorithm": algorithm.save(), "rnd_steps": steps, "score": self._score}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what was saved: see `Learning`. RND that was off until then begins again."""
+        """Resume from a saved state: see `Learning`. RND that was off until then starts from scratch."""
         self._score = state.get("score")
         saved, has_rnd = dict(state["algorithm"]), "rnd_state_dict" in state["algorithm"]
         self.algorithm.load(saved, dict.fromkeys(("actor", "critic", "optimizer", "iteration"), True) | {"rnd": has_rnd}, True)
@@ -330,16 +330,16 @@ class Learner(Learning):
         return None if std is None else std.tolist()
 
     def write_policy(self, card: Mapping[str, Any], file: Path) -> None:
-        """Write the policy without exploration, as TorchScript and ONNX, and its card beside it as JSON, for people."""
+        """Write the policy without exploration, as TorchScript and ONNX, and its card as a readable JSON file."""
         policy: Any = self.algorithm.get_policy()
         texts = card_texts(self.env.touch, card)
         write_policy(policy.as_jit(), texts, file)
         write_onnx_policy(policy.as_onnx(verbose=False), texts, file.with_suffix(".onnx"))
 
     def change_rates(self, before: Mapping[str, Any]) -> None:
-        """Take over the document's learning rates, once a state was loaded; one that adapts only if the document had another.
+        """Set the document's learning rates after a state was loaded; an adaptive one only if the document changed it.
 
-        `before` is the document's `train` with which the state was saved, as plain values.
+        `before` is the saved document's `train`, as plain values.
         """
         train = self._train
         if not train.adaptive or before.get("learning_rate", train.learning_rate) != train.learning_rate:

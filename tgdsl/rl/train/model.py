@@ -1,8 +1,8 @@
 """Networks of actor and critic, their normalisers, and random network distillation: rsl_rl's, kept on the device.
 
 `class_name: tgdsl.rl.train.model:EncodedModel` gives rsl_rl this model, and `tgdsl.rl.train.model:Gaussian` its distribution.
-No branch waits for a tensor's value, and memory stays where it is. Moments are float64: after many rows a change is lost in
-float32. Over several processes they are those of the joint batch.
+No branch waits for a tensor's value, and memory stays where it is. Moments are float64, as float32 loses small updates after
+many rows. Several processes share the moments of the joint batch.
 
 Shapes: `env` environments, `feature` numbers of all groups of a model, side by side, `row` rows of a batch, of any shape.
 """
@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from tgdsl.rl.train.ranks import add_up, num_processes
 
-UNTIL = 10**8  # as rsl_rl has it: after so many states, and rewards, their normalisation does not change any more
+UNTIL = 10**8  # number of states or rewards after which their normalisation is constant: rsl_rl's
 
 
 class Normalisation(EmpiricalNormalization):
@@ -80,7 +80,7 @@ class RewardNormalisation(EmpiricalDiscountedVariationNormalization):
         self.register_buffer("total", torch.zeros(num_envs), persistent=False)
 
     def forward(self, rew: Float[Tensor, " row"]) -> Float[Tensor, " row"]:
-        """Return rewards normalised; those of learning are taken into account first."""
+        """Return rewards normalised; in training mode they update the moments first."""
         total: Tensor = self.total  # pyright: ignore[reportAssignmentType]
         if self.training:
             total.mul_(self.gamma).add_(rew)
@@ -90,13 +90,13 @@ class RewardNormalisation(EmpiricalDiscountedVariationNormalization):
 
 
 class Gaussian(GaussianDistribution):
-    """rsl_rl's Gaussian distribution; to draw from it waits for nothing, where torch's own looks at the deviations' signs."""
+    """rsl_rl's Gaussian distribution; sampling does not synchronise, while torch's checks the deviations' signs."""
 
     def sample(self) -> Tensor:
         return torch.randn_like(self.mean) * self.std + self.mean
 
     def bound(self) -> None:
-        """Put deviations back within their range: beyond it rsl_rl's clamp has no gradient, and they could not return."""
+        """Clamp deviations to their range: beyond it rsl_rl's clamp has no gradient, and they could not return."""
         if self.std_type == "scalar":
             self.std_param.clamp_(*self.std_range)
         else:
@@ -138,17 +138,17 @@ class EncodedModel(MLPModel):
         return self.embed(torch.cat([obs[name] for name in self.obs_groups], dim=-1))
 
     def embed(self, x: Tensor) -> Tensor:
-        """Return the embeddings of groups that stand side by side, (env, feature)."""
+        """Return the embeddings of concatenated groups, (env, feature)."""
         parts = self.obs_normalizer(x).split(self._sizes, dim=-1)
         return torch.cat([encoder(part) for encoder, part in zip(self.encoders, parts, strict=True)], dim=-1)
 
     def as_jit(self) -> nn.Module:
-        """Return what acts without exploration, as TorchScript: takes (env, feature)."""
+        """Return the policy without exploration, as TorchScript: takes (env, feature)."""
         exported = Exported(self).cpu()
         return torch.jit.trace(exported, exported.get_dummy_inputs())  # pyright: ignore[reportReturnType]
 
     def as_onnx(self, verbose: bool) -> nn.Module:
-        """Return what acts without exploration, as rsl_rl exports it to ONNX."""
+        """Return the policy without exploration, as rsl_rl exports it to ONNX."""
         return Exported(self)
 
     def _get_latent_dim(self) -> int:
@@ -156,7 +156,7 @@ class EncodedModel(MLPModel):
 
 
 class Exported(nn.Module):
-    """A copy of a model that takes groups side by side, (env, feature), and returns what it would do without exploration."""
+    """A copy of a model that takes concatenated groups, (env, feature), and returns actions without exploration."""
 
     is_recurrent = False
     input_names = ("obs",)
@@ -166,7 +166,7 @@ class Exported(nn.Module):
         super().__init__()
         distribution = model.distribution
         if distribution is not None:
-            model.distribution = None  # what it was updated with last belongs to a graph of gradients, and cannot be copied
+            model.distribution = None  # its last parameters belong to an autograd graph, and cannot be copied
         try:
             self.model = copy.deepcopy(model).eval()
         finally:
@@ -178,13 +178,13 @@ class Exported(nn.Module):
         return self.output(self.model.mlp(self.model.embed(x)))
 
     def get_dummy_inputs(self) -> tuple[Tensor]:
-        """Return an example of what it takes."""
+        """Return example inputs."""
         first = next(self.parameters())
         return (torch.zeros((2, self.model.obs_dim), dtype=first.dtype, device=first.device),)
 
 
 class Distillation(RandomNetworkDistillation):
-    """rsl_rl's `RandomNetworkDistillation`, whose rewards wait for no tensor's value."""
+    """rsl_rl's `RandomNetworkDistillation` with rewards that do not synchronise."""
 
     def __init__(self, num_envs: int, eps: float = 1e-2, clip: float = float("inf"), **options: Any):
         super().__init__(**options)

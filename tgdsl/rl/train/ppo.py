@@ -1,10 +1,9 @@
-"""rsl_rl's PPO, whose rollout and update wait for no tensor's value, and are captured as CUDA graphs on a GPU.
+"""rsl_rl's PPO without synchronisation in rollout and update, both captured as CUDA graphs on a GPU.
 
 `class_name: tgdsl.rl.train.ppo:CapturedPPO` gives it to rsl_rl. It does what rsl_rl 5.5's own PPO does, with these
-departures: the learning rate is a tensor on the device; gradients are those of `torch.autograd.grad`, in one buffer; to learn
-draws no actions; over several processes, advantages are normalised by mean and deviation of all of them. Where an episode is
-cut off because its time is over, the return goes on with the value of the observations at its end, V(o_T), if they are given;
-rsl_rl's goes on with the value before the last step.
+departures: the learning rate is a tensor on the device; `torch.autograd.grad` writes gradients into one buffer; updates draw no
+actions; several processes normalise advantages by the mean and deviation of all of them. At a time limit the return bootstraps
+from the value of the final observations, V(o_T), if they are given; rsl_rl bootstraps from the value before the last step.
 
 Shapes: `env` environments, `joint` joints that the policy moves, `row` rows of a mini-batch.
 """
@@ -27,7 +26,7 @@ from tgdsl.rl.train.model import Distillation, Gaussian
 from tgdsl.rl.train.ranks import add_up, num_processes
 from tgdsl.tensors.torch_internals import copy_each
 
-LEAST_RATE, MOST_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5  # bounds of the adaptive learning rate, and by what it changes: rsl_rl's
+LEAST_RATE, MOST_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5  # bounds of the adaptive learning rate, and factor of its steps: rsl_rl's
 LOSSES = ("value", "surrogate", "entropy", "rnd")
 
 
@@ -46,7 +45,7 @@ class CapturedPPO(PPO):
         precision: str = "tf32",
         **options: Any,
     ):
-        """Make the algorithm; raise `TgdslError` if something is asked for that cannot be captured."""
+        """Make the algorithm; raise `TgdslError` if an option cannot be captured."""
         _refuse(actor, critic, options)
         rows, parts = storage.num_envs * storage.num_transitions_per_env, options.get("num_mini_batches", 1)
         if rows < max(2, parts):
@@ -84,7 +83,7 @@ class CapturedPPO(PPO):
         self.rate.fill_(rate)
 
     def act(self, obs: TensorDict) -> Tensor:
-        """Draw actions, (env, joint), and remember what led to them; they hold until the next call."""
+        """Draw actions, (env, joint), and store their transition; they are valid until the next call."""
         self._see(obs)
         transition = self.transition
         transition.actions, transition.values, transition.actions_log_prob, transition.distribution_params = self._chosen()
@@ -93,7 +92,7 @@ class CapturedPPO(PPO):
         return transition.actions
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
-        """Keep what a control step has brought: see rsl_rl."""
+        """Store the results of a control step: see rsl_rl."""
         transition = self.transition
         reward = rewards.clone()
         transition.dones = dones
@@ -148,7 +147,7 @@ class CapturedPPO(PPO):
         return {name: self.losses[i] for i, name in enumerate(LOSSES) if name != "rnd" or self.rnd is not None}
 
     def load(self, loaded_dict: dict[str, Any], load_cfg: dict[str, Any] | None, strict: bool) -> bool:
-        """Take over what was saved: see rsl_rl; what was captured is captured again."""
+        """Load a saved state: see rsl_rl; graphs are captured again."""
         is_loaded = super().load(loaded_dict, load_cfg, strict)
         optimisers = [self.optimizer, *([self.rnd.optimizer] if self.rnd else [])]
         for group in (group for optimizer in optimisers for group in optimizer.param_groups):
@@ -168,10 +167,10 @@ class CapturedPPO(PPO):
             for tensor in model.state_dict().values():
                 torch.distributed.broadcast(tensor, src=0)
 
-    # What is captured
+    # Captured functions
 
     def _collect_gradients(self) -> None:
-        """Have all gradients, and after them the policy's divergence, in one buffer; and optimisers that stay on the device."""
+        """Put all gradients, then the policy's divergence, in one buffer, and make optimisers that stay on the device."""
         networks = [*self.actor.parameters(), *self.critic.parameters()]
         self._weights = [parameter for parameter in networks if parameter.requires_grad]
         self._predictor = list(self.rnd.predictor.parameters()) if self.rnd is not None else []
@@ -233,7 +232,7 @@ class CapturedPPO(PPO):
             self._take_step()
 
     def _differentiate(self, i: int) -> None:
-        """Compute the gradients of mini-batch i, and how far the policy has moved."""
+        """Compute the gradients of mini-batch i, and the policy's divergence."""
         storage, rows = self.storage, self._order[i * self._rows : (i + 1) * self._rows]
         with torch.no_grad():
             obs = TensorDict({name: each.flatten(0, 1)[rows] for name, each in storage.observations.items()}, [len(rows)])

@@ -1,6 +1,6 @@
-"""The processes that learn together, as torchrun starts them, each with environments of its own.
+"""Processes that learn together, as torchrun starts them, each with separate environments.
 
-With one process nothing is done. The backend is NCCL on GPUs and gloo on CPUs.
+A single process does nothing here. The backend is NCCL on GPUs and gloo on CPUs.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class RankError(TgdslError):
 
 @dataclass(frozen=True)
 class Ranks:
-    """Which process of how many this is, from 0; `local`: its number among those of this host, its GPU."""
+    """Rank of this process, from 0, and number of processes; `local`: its rank on this host, its GPU."""
 
     rank: int = 0
     size: int = 1
@@ -30,19 +30,19 @@ class Ranks:
 
     @staticmethod
     def of(environ: Mapping[str, str] = os.environ) -> Ranks:
-        """Return what torchrun says."""
+        """Return the ranks that torchrun sets."""
         return Ranks(
             *(int(environ.get(name, default)) for name, default in (("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0)))
         )
 
     @property
     def is_first(self) -> bool:
-        """Whether this process writes and tells."""
+        """Whether this process writes files and progress."""
         return self.rank == 0
 
     @property
     def rsl_rl(self) -> dict[str, int] | None:
-        """What rsl_rl's `multi_gpu` takes."""
+        """The value of rsl_rl's `multi_gpu`."""
         return {"global_rank": self.rank, "local_rank": self.local, "world_size": self.size} if self.size > 1 else None
 
     def device(self, device: str) -> str:
@@ -54,7 +54,7 @@ class Ranks:
         return f"cuda:{self.local}"
 
     def join(self, device: str) -> None:
-        """Meet the other processes, if there are any and they have not met."""
+        """Join the process group, if there are other processes and this one has not joined."""
         if self.size == 1 or distributed.is_initialized():
             return
         is_gpu = device.partition(":")[0] == "cuda"
@@ -63,7 +63,7 @@ class Ranks:
         distributed.init_process_group("nccl" if is_gpu else "gloo", rank=self.rank, world_size=self.size)
 
     def leave(self) -> None:
-        """Leave the other processes, if this one has met them."""
+        """Leave the process group, if this process has joined."""
         if self.size > 1 and distributed.is_initialized():
             distributed.destroy_process_group()
 
@@ -76,7 +76,7 @@ class Ranks:
         return tuple(bool(each) for each in numbers.tolist())
 
     def gathered(self, own: Any) -> list[Any]:
-        """Return what each process has, in all of them."""
+        """Return each process's value, in all of them."""
         if self.size == 1:
             return [own]
         every: list[Any] = [None] * self.size

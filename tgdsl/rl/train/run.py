@@ -1,9 +1,9 @@
-"""A run: iterations until enough were made or time is over, with checkpoints on the way, so that it may be killed.
+"""A run: iterations up to a number or a time limit, with checkpoints, so that it may be killed.
 
-A checkpoint holds networks, normalisers, optimisers, learning rate, iteration, random generators, and of each environment how
-often it was reset, how often it was read and how long its episode has lasted; of the physics it holds nothing. A run that goes
-on begins new episodes, with random numbers that were not drawn before, whose remaining times are as they were. Other numbers of
-environments or processes go on from it too, with episodes that begin as in a new run.
+A checkpoint holds networks, normalisers, optimisers, learning rate, iteration, random generators, and each environment's
+numbers of resets and readings and its episode's steps; it holds no physics. A resumed run begins new episodes with new random
+numbers and the saved remaining times. It may have other numbers of environments or processes; episodes then begin as in a new
+run.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ LINE_INTERVAL = 10.0  # time between lines where there is no terminal for a prog
 
 
 class ProgressBar:
-    """A progress bar of a run; where there is no terminal, a line now and then."""
+    """A progress bar of a run; without a terminal, occasional lines."""
 
     def __init__(self, iterations: int | None, done: int, unit: str):
         self._unit, self._total, self._last_line = unit, iterations, -LINE_INTERVAL
@@ -66,7 +66,7 @@ class ProgressBar:
 
 
 class DivergedError(TgdslError):
-    """A policy whose losses, or whose state, are no numbers any more."""
+    """A policy whose losses or state are not finite."""
 
 
 Show = Callable[[Mapping[str, float | int], float], None]
@@ -75,7 +75,7 @@ Show = Callable[[Mapping[str, float | int], float], None]
 
 @contextlib.contextmanager
 def stop_requests() -> Iterator[list[signal.Signals]]:
-    """Yield a list that gets the first SIGINT (Ctrl-C) or SIGTERM, to end work at a good place; the second acts as before."""
+    """Yield a list that collects the first SIGINT (Ctrl-C) or SIGTERM; a second one has its default effect."""
     received: list[signal.Signals] = []
     handlers: dict[signal.Signals, Any] = {}
 
@@ -96,13 +96,13 @@ def stop_requests() -> Iterator[list[signal.Signals]]:
 
 
 class Run:
-    """A run in its folder; `seconds` of learning do not count what it takes to make environments and to evaluate.
+    """A run in its folder; `seconds` of learning exclude the time to make environments and to evaluate.
 
-    `resume` is the command that goes on from its checkpoint.
+    `resume` is the command that continues from its checkpoint.
     """
 
     def __init__(self, learner: Learning, folder: RunFolder, every: float, resume: str, seconds: float = 0.0):
-        """Write the first checkpoint: a folder or disk that cannot take it is found now."""
+        """Write the first checkpoint, so that an unwritable folder or full disk raises now."""
         self.learner, self._folder, self._every, self._resume, self.seconds = learner, folder, every, resume, seconds
         self._rate, self._samples, self._saved = 0.0, learner.samples, learner.iteration
         self.stopped_by: signal.Signals | None = None  # the signal that has ended `learn`
@@ -113,7 +113,7 @@ class Run:
         self.board = _board(folder.path, learner.iteration) if self._writes else None
 
     def save(self) -> None:
-        """Write a checkpoint; of several processes the first one does."""
+        """Write a checkpoint, by the first process."""
         learner = self.learner
         state = state_of(learner, self.seconds)
         if wrong := not_finite(state, learner.groups, learner.env.groups):
@@ -140,8 +140,8 @@ class Run:
     def learn(self, iterations: int, seconds: float, show: Show | None = None) -> None:
         """Learn. Ctrl-C and SIGTERM end it after the iteration under way, with a checkpoint.
 
-        Iterations get the share of the run that is over: of iterations, or if that is more, of time, what was learned before
-        included: a run that was killed and goes on for the rest of its time goes on as if it had not been.
+        Iterations get the finished share of the run: of iterations or of time, whichever is larger, including earlier starts.
+        So a killed run that resumes for the rest of its time continues as if uninterrupted.
         """
         with self.named_in_file_errors(), stop_requests() as received:
             try:
@@ -154,7 +154,7 @@ class Run:
 
     @contextlib.contextmanager
     def named_in_file_errors(self) -> Iterator[None]:
-        """Have errors of files that cannot be written name the last checkpoint, and the command that goes on from it."""
+        """Add the last checkpoint and the command that resumes from it to errors of files that cannot be written."""
         try:
             yield
         except FileError as error:
@@ -162,7 +162,7 @@ class Run:
             raise FileError(error.file, f"{error.reason}; {hint}") from error
 
     def end_if_stopped(self) -> None:
-        """End the process if a signal has stopped the run, and say how to go on."""
+        """Exit if a signal has stopped the run, with the command that resumes it."""
         if self.stopped_by is not None:
             stopped = f"stopped by {self.stopped_by.name} after iteration {self.learner.iteration}"
             print(f"{stopped}; to go on: {self._resume}", file=sys.stderr)
@@ -185,7 +185,7 @@ class Run:
             is_over, is_due = learner.ranks.agreed((is_over, is_due), learner.env.device)
             if is_due:
                 self.save()
-                saved = now  # until it is written, what was there before counts
+                saved = now  # of the iteration's end: the previous checkpoint counts until this one is written
 
     def _tell(self, iteration: Iteration, duration: float, iterations: int, time_left: float, show: Show | None) -> None:
         """Write an iteration into curve and TensorBoard, and show it."""
@@ -227,16 +227,16 @@ class Run:
 
 
 def _board(folder: Path, done: int) -> Any:
-    """Return what writes for TensorBoard; None if that is not installed."""
+    """Return a writer for TensorBoard; None if that is not installed."""
     with contextlib.suppress(ImportError), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of its own packages
+        warnings.simplefilter("ignore")  # from TensorBoard's dependencies
         from torch.utils.tensorboard import SummaryWriter
 
         return SummaryWriter(str(folder), flush_secs=10, purge_step=done + 1 if done else None)
 
 
 def state_of(learner: Learning, seconds: float) -> dict[str, Any]:
-    """Return all that a run goes on from, after so many seconds of learning; all processes call it."""
+    """Return a checkpoint's state after so many seconds of learning; all processes call it."""
     env = learner.env
     state = {
         "resets": env.resets.cpu().clone(),
@@ -257,15 +257,15 @@ def state_of(learner: Learning, seconds: float) -> dict[str, Any]:
 
 
 def restore(learner: Learning, state: Mapping[str, Any], file: Path) -> None:
-    """Have a learner of the same groups and networks go on from a checkpoint; `file` is named in errors."""
+    """Restore a learner of the same groups and networks from a checkpoint; errors name `file`."""
     env, rank = learner.env, learner.ranks.rank
     names = state["groups"].keys() | learner.groups.keys()
     if state["groups"].keys() ^ learner.groups.keys() == {"rnd_state"}:  # RND was turned on or off
         names -= {"rnd_state"}
     if other := sorted(name for name in names if state["groups"].get(name) != learner.groups.get(name)):
-        before, now = ({name: groups.get(name) for name in other} for groups in (state["groups"], learner.groups))
+        saved_groups, now = ({name: groups.get(name) for name in other} for groups in (state["groups"], learner.groups))
         hint = "a network cannot go on with other groups: begin a new run without --resume"
-        raise CheckpointError(f"{file}: learned from the groups {before}, not {now}; {hint}")
+        raise CheckpointError(f"{file}: learned from the groups {saved_groups}, not {now}; {hint}")
     try:
         learner.load_state_dict(state)
     except (RuntimeError, ValueError, KeyError) as error:
@@ -304,7 +304,7 @@ def not_finite(state: Any, networks: Mapping[str, Sequence[str]], sizes: Mapping
 
 
 def _count_on(env: TouchEnv, processes: Sequence[Mapping[str, Any]]) -> None:
-    """Have environments go on to draw what was not drawn: each from its own counts, or all from the largest of any."""
+    """Continue the environments' counters, so that no random number repeats: each from its own, or all from the largest."""
     for name, count in ({"resets": env.resets} | _clock(env)).items():
         saved = [each["resets"] if name == "resets" else each.get("touch", {}).get(name) for each in processes]
         saved = [value for value in saved if value is not None]  # an earlier checkpoint has none of touch

@@ -1,8 +1,8 @@
-"""How a policy is learned: the numbers of PPO, of its networks and of random network distillation.
+"""Training of a policy: the parameters of PPO, its networks and random network distillation.
 
-Source of the defaults: Chung et al., *Tactile Genesis*, appendix, "Optimization and Network Hyperparameters"; the tasks' own
-departures from them stand in their specs. What the paper leaves open, and is chosen here: `eps`, `clip`, the encoders' use by
-both actor and critic, the RND networks' widths and weight, `desynchronise`, `precision`, the checkpoints' times.
+Source of the defaults: Chung et al., *Tactile Genesis*, appendix, "Optimization and Network Hyperparameters"; the tasks' specs
+have their departures. Not in the paper, and ours: `eps`, `clip`, encoders in both actor and critic, the RND networks' widths
+and weight, `desynchronise`, `precision`, the checkpoints' times.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class EncoderSpec(SpecModel):
 
 
 class TouchEncoderSpec(EncoderSpec):
-    """The network that embeds what is felt."""
+    """The network that embeds touch."""
 
     hidden: Widths = (64, 64)
     """Widths of its hidden layers."""
@@ -44,17 +44,17 @@ class NetworksSpec(SpecModel):
     """Networks of actor and critic: groups are normalised, each is embedded, and the embeddings are mapped together."""
 
     encoder: EncoderSpec = EncoderSpec()
-    """Of each group but touch."""
+    """Encoder of each group except touch."""
     touch_encoder: TouchEncoderSpec = TouchEncoderSpec()
-    """Of `tactile_sensors`."""
+    """Encoder of `tactile_sensors`."""
     hidden: Widths = WIDTHS
     """Widths of the hidden layers that follow the embeddings."""
     initial_std: Positive = 1.0
     """Standard deviation of the actions at the start."""
     min_std: NonNegative = 0.0
-    """Standard deviation below which exploration does not fall; at most `initial_std`."""
+    """Least standard deviation of the actions; at most `initial_std`."""
     eps: Positive = 1e-5
-    """What is added to the standard deviation by which an observation is divided, in the observation's unit."""
+    """Offset of the standard deviation that normalises an observation, in the observation's unit."""
     clip: Positive = 10.0
     """Bound of normalised observations."""
 
@@ -66,14 +66,14 @@ class NetworksSpec(SpecModel):
 
 
 class RndSpec(SpecModel):
-    """Random network distillation: what is new to the predictor pays."""
+    """Random network distillation: the predictor's error is an intrinsic reward."""
 
     groups: Groups | None = None
-    """Groups of observations that are looked at; default: `priv_obj_state` if there is one, else those of the actor."""
+    """Its groups of observations; default: `priv_obj_state` if there is one, else the actor's."""
     weight: NonNegative = 1.0
     """Reward per second for one standard deviation of the prediction's error [1/s]."""
     outputs: Whole = 8
-    """Size of the embedding that is predicted."""
+    """Size of the predicted embedding."""
     predictor: Widths = (256, 128)
     """Widths of the predictor's hidden layers."""
     target: Widths = (256, 128)
@@ -86,29 +86,30 @@ Rnd = Annotated[Annotated[Literal["off"], Tag("text")] | Annotated[RndSpec, Tag(
 
 
 class TrainSpec(SpecModel):
-    """How a policy is learned."""
+    """Training of a policy."""
 
     iterations: Whole = 6000
     """Iterations of the whole run: rollout and update."""
     steps: Whole = 24
     """Control steps of each environment per iteration."""
     actor: Groups | None = None
-    """Groups of observations that the actor sees; default, the paper's teacher: all but `tactile_sensors`, `priv_obj_props` and
+    """The actor's groups of observations; default, as the paper's teacher: all except `tactile_sensors`, `priv_obj_props` and
     `proprio`, which `priv_proprio` contains."""
     critic: Groups | None = None
-    """Groups of observations that the critic sees; default: those of the default actor, and `priv_obj_props`."""
+    """The critic's groups of observations; default: the default actor's, and `priv_obj_props`."""
     networks: NetworksSpec = NetworksSpec()
     """Networks of actor and critic."""
     rnd: Rnd = RndSpec()
     """Random network distillation, or `off`."""
     learning_rate: Positive = 1e-3
-    """Learning rate, at the start where it is adaptive."""
+    """Learning rate; if adaptive, the initial one."""
     adaptive: StrictBool = True
     """Whether the learning rate follows the change of the policy: `desired_kl`."""
     desired_kl: Positive = 0.01
-    """Divergence of a mini-batch's policy from that of the rollout: above twice of it the rate falls, below half it rises."""
+    """Target KL divergence between a mini-batch's policy and the rollout's: above twice it the rate falls, below half it
+    rises."""
     epochs: Whole = 5
-    """How often an update goes through its rollout."""
+    """Passes of an update through its rollout."""
     mini_batches: Whole = 4
     """Mini-batches of an epoch."""
     discount: Share = 0.998
@@ -116,22 +117,22 @@ class TrainSpec(SpecModel):
     gae: Share = 0.95
     """λ of the generalised advantage estimate."""
     clip: Positive = 0.2
-    """Bound of the change of a probability ratio, and of a value where these are clipped."""
+    """Bound of the change of a probability ratio, and of a value with `clip_values`."""
     clip_values: StrictBool = True
-    """Whether a value may change by no more than `clip` in an update, as the paper and rsl_rl have it."""
+    """Whether values are clipped to a change of `clip` in an update, as in the paper and rsl_rl."""
     entropy: NonNegative = 2e-3
     """Weight of the entropy."""
     value: NonNegative = 1.0
     """Weight of the value's error."""
     max_grad_norm: Positive = 1.0
-    """Norm to which gradients are scaled down, of actor and critic each."""
+    """Largest norm of the gradients, of actor and critic each."""
     desynchronise: StrictBool = True
     """Whether first episodes end at random times, so that later ones do not end together."""
     precision: Precision = "tf32"
-    """How a GPU multiplies matrices: `float32`, `tf32` (ten bits of mantissa), or `bfloat16` (seven), of which activations then
-    are too; weights, gradients, losses and all else are float32."""
+    """Precision of a GPU's matrix products: `float32`, `tf32` (ten bits of mantissa), or `bfloat16` (seven), then also of
+    activations; weights, gradients, losses and all else are float32."""
     checkpoint: Time = 10.0
-    """What a run that is killed loses at most, if its iterations are no longer [s]."""
+    """Longest time that a killed run loses, if its iterations are no longer [s]."""
 
     @model_validator(mode="after")
     def _check(self) -> TrainSpec:
