@@ -92,13 +92,13 @@ class TriangleMesh:
 
 
 _NODE_OPERATIONS, _FACE_OPERATIONS = 40, 100
-"""Of a box of the hierarchy that a search opens, and of a face whose nearest point is found, about."""
+"""Approximate operations per opened box of the hierarchy, and per face whose nearest point is computed."""
 
 
 def query_operations(point: Tensor, which: Tensor, keys: Sequence[int]) -> int:
-    """Return how many elementary operations `mesh_distance` takes, about: two descents of a hierarchy for each point.
+    """Return about how many elementary operations `mesh_distance` takes: two descents of the hierarchy for each point.
 
-    One is for the nearest face, one for the winding number; of each level some two boxes are opened, and some eight faces.
+    One is for the nearest face, one for the winding number; each opens about two boxes per level, and eight faces.
     """
     num_faces = max(len(_MESHES[key].faces) for key in keys)
     return 2 * len(point) * round(2 * math.log2(num_faces + 1) * _NODE_OPERATIONS + 8 * _FACE_OPERATIONS)
@@ -116,13 +116,13 @@ def nearest(
 
     The derivative of the distance is the gradient; the gradient itself has none. Points outside that are farther than
     `max_distance` [m] read it; their gradient is (1, 0, 0), and the derivative 0. Inside there is no limit. NaN reads NaN.
-    Of several meshes each point asks the one that `which` names.
+    With several meshes `which` is the index of each point's mesh.
     """
     stacked = torch.stack(point, dim=-1)
     flat = stacked.reshape(-1, 3).to(torch.float64).contiguous()
-    chosen = flat.new_empty(0) if which is None else which.expand(point[0].shape).reshape(-1)
+    mesh_of_point = flat.new_empty(0) if which is None else which.expand(point[0].shape).reshape(-1)
     keys = [mesh.key for mesh in meshes]
-    distance, gradient = torch.ops.tgdsl.mesh_distance(flat, chosen.to(torch.int32), keys, max_distance)
+    distance, gradient = torch.ops.tgdsl.mesh_distance(flat, mesh_of_point.to(torch.int32), keys, max_distance)
     return distance.to(stacked.dtype).reshape(point[0].shape), split(gradient.to(stacked.dtype).reshape(stacked.shape))
 
 
@@ -178,15 +178,15 @@ def _warp() -> Any:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[Any]:
-    """Yield Warp, kept from announcing itself and the kernels that it loads."""
+    """Yield Warp with its log messages below errors off."""
     wp = _warp()
-    before = wp.config.log_level
-    wp.config.log_level = max(before, wp.LOG_ERROR)
+    log_level = wp.config.log_level
+    wp.config.log_level = max(log_level, wp.LOG_ERROR)
     try:
         wp.init()
         yield wp
     finally:
-        wp.config.log_level = before
+        wp.config.log_level = log_level
 
 
 @functools.cache
@@ -223,11 +223,11 @@ def _kernel(wp: Any) -> Any:
         """The nearest face, −1 if none is within reach, and the vector from it to the point."""
         face, best, length = wp.int32(-1), wp.vec3d(), wp.float64(reach)
         slack = wp.float64(1e-5) * size
-        found = wp.mesh_query_point_no_sign(mesh, wp.vec3(p), wp.float32(wp.float64(1.00001) * reach + slack))
-        if found.result:
-            away = away_from(found.face, corners, p)
+        hit = wp.mesh_query_point_no_sign(mesh, wp.vec3(p), wp.float32(wp.float64(1.00001) * reach + slack))
+        if hit.result:
+            away = away_from(hit.face, corners, p)
             if wp.length(away) < length:
-                face, best, length = wp.int32(found.face), away, wp.length(away)
+                face, best, length = wp.int32(hit.face), away, wp.length(away)
         if boxes != wp.uint64(0):
             near = wp.bvh_query_sphere(boxes, wp.vec3(p), wp.float32(wp.float64(1.00001) * length + slack))
             item = wp.int32(0)
@@ -271,8 +271,8 @@ def _kernel(wp: Any) -> Any:
                 direction = sign * direction
                 is_decided = True
         if not is_decided:
-            found = wp.mesh_query_point_sign_winding_number(mesh, wp.vec3(probe), wp.inf)
-            sign = wp.where(found.result and found.sign < 0.0, -one, one)
+            hit = wp.mesh_query_point_sign_winding_number(mesh, wp.vec3(probe), wp.inf)
+            sign = wp.where(hit.result and hit.sign < 0.0, -one, one)
         distance[i] = wp.where(wp.isnan(p), wp.float64(wp.nan), sign * length)
         gradient[i] = wp.where(wp.isnan(p), wp.vec3d(wp.float64(wp.nan)), wp.where(face >= 0, sign, one) * direction)
 

@@ -26,7 +26,7 @@ Weights = Callable[[Tensor], Nodes]
 
 
 class Grid(NamedTuple):
-    """Signed distance at the nodes of a grid, negative inside; or of several, of which each point asks one.
+    """Signed distance at the nodes of one or several grids, negative inside; each point is looked up in one grid.
 
     Counts that are the same for all points may be Python's: a compiler then makes them part of the code.
     """
@@ -85,8 +85,8 @@ def _interpolate(point: Vec, grid: Grid, weights: Weights, first: int) -> tuple[
     """Interpolate between the nodes `first`, `first` + 1, … counted from the cell's lower corner."""
     place = [(part - start) / grid.cell for part, start in zip(point, grid.origin, strict=True)]
     inside = [within(part, num - 1) for part, num in zip(place, grid.num, strict=True)]
-    # What is within `tie` of the next cell counts as in it, so that a point at rest on a face of cells keeps its gradient.
-    # What is not a number becomes an arbitrary integer: only the integer's own clamp makes it an index.
+    # A point within `tie` of the next cell counts as in it, so a point at rest on a face of cells keeps its gradient.
+    # NaN becomes an arbitrary integer; the clamp after the conversion makes it a valid index.
     slack = tie() / grid.cell
     lower = vec(within((part + slack).floor().long(), num - 2) for part, num in zip(inside, grid.num, strict=True))
     along_x, along_y, along_z = (weights(part - corner) for part, corner in zip(inside, lower, strict=True))
@@ -110,7 +110,7 @@ def far() -> float:
 
 
 def within(place: Tensor, last: Count) -> Tensor:
-    """Return a place along an axis, or its index, brought into the range from 0 to the last; what is no number stays none."""
+    """Clamp a coordinate or an index along an axis to the range from 0 to the last; NaN stays NaN."""
     return place.clamp(0, last) if isinstance(last, int) else torch.minimum(place.clamp(min=0), last.to(place.dtype))
 
 

@@ -25,10 +25,10 @@ Vec, Rot = VecOf[Tensor], RotOf[Tensor]
 
 
 def tie() -> float:
-    """Return by how much [m] lengths may differ and count as equal, of which the first wins.
+    """Return the tolerance [m] within which lengths count as equal; the first of equals wins.
 
-    So what is nearest, and which way is out, does not alternate with the last digits of a pose at rest. Float32 resolves a few
-    centimetres not much better.
+    So the nearest surface and the outward direction do not alternate with the last digits of a pose at rest. Float32 resolves
+    a few centimetres not much better.
     """
     return 1e-7
 

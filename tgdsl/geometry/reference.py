@@ -74,7 +74,7 @@ def _ellipsoid(size: Array, point: Array) -> tuple[Array, bool, Array]:
     def excess(u: float) -> float:
         return sum((part / (u + rest)) ** 2 for part, rest in terms) - 1.0
 
-    # If no u above the pole 0 solves it, the nearest points are a mirrored pair, of which the positive is taken.
+    # If no u above the pole 0 solves it, the nearest points are a mirrored pair: take the positive one.
     flat = square > square[least]
     at_pole = np.sum((size[flat] * y[flat] / gap[flat]) ** 2)
     if not np.any(y[square == square[least]] > 0) and at_pole <= 1.0:

@@ -1,9 +1,8 @@
 """Signed distance of MuJoCo's primitives, negative inside, and its unit gradient.
 
 Every function takes a point in the geom's frame [m] and the geom's size as MuJoCo defines it [m] (tensors that broadcast
-with the point), and returns the distance [m] and the outward gradient. Both are exact, in every place: at centres, on
-axes, edges and corners, where the nearest surface point is not unique, one of the candidates is taken, always the same; what is
-within `planes.tie()` of such a place counts as in it.
+with the point), and returns the distance [m] and the outward gradient. Both are exact everywhere. At centres, axes, edges and
+corners the nearest surface point is not unique: the functions always return the same candidate, also within `planes.tie()`.
 Derivatives of the distance are the gradient; all are finite.
 """
 

@@ -41,14 +41,14 @@ def gradient_of(shape, size, point):
     first, second = tl.load(size), tl.load(size + 1)
     gradient = (tl.zeros_like(x), tl.zeros_like(x), tl.full(x.shape, 1.0, tl.float32))
     if is_any(shape == CAPSULE):
-        gradient = chosen(shape == CAPSULE, direction(x, y, z - tl.clamp(z, -second, second)), gradient)
+        gradient = select(shape == CAPSULE, direction(x, y, z - tl.clamp(z, -second, second)), gradient)
     if is_any(shape == CYLINDER):
         ux, uy, _ = direction(x, y, tl.zeros_like(x))
         wall, _, end = _from_walls(tl.sqrt(x * x + y * y) - first, float("-inf"), tl.abs(z) - second)
-        gradient = chosen(shape == CYLINDER, (wall * ux, wall * uy, end * _sign(z)), gradient)
+        gradient = select(shape == CYLINDER, (wall * ux, wall * uy, end * _sign(z)), gradient)
     if is_any(shape == BOX):
         wx, wy, wz = _from_walls(tl.abs(x) - first, tl.abs(y) - second, tl.abs(z) - tl.load(size + 2))
-        gradient = chosen(shape == BOX, (wx * _sign(x), wy * _sign(y), wz * _sign(z)), gradient)
+        gradient = select(shape == BOX, (wx * _sign(x), wy * _sign(y), wz * _sign(z)), gradient)
     return gradient
 
 
@@ -67,7 +67,7 @@ def _from_walls(x, y, z):
     is_y = (y >= z - TIE) & (x < tl.maximum(y, z) - TIE)
     inner = (tl.where(is_x, 1.0, 0.0), tl.where(is_y, 1.0, 0.0), tl.where(is_x | is_y, 0.0, 1.0))
     inverse = 1.0 / tl.where(outside > TIE, outside, 1.0)
-    return chosen(outside > TIE, (wx * inverse, wy * inverse, wz * inverse), inner)
+    return select(outside > TIE, (wx * inverse, wy * inverse, wz * inverse), inner)
 
 
 @triton.jit
@@ -75,7 +75,7 @@ def direction(x, y, z):
     """Return the unit vector along one, a fixed one if it is null."""
     norm = length(x, y, z)
     inverse = 1.0 / tl.where(norm <= TIE, 1.0, norm)
-    return chosen(
+    return select(
         norm <= TIE,
         (tl.full(x.shape, 1.0, tl.float32), tl.zeros_like(x), tl.zeros_like(x)),
         (x * inverse, y * inverse, z * inverse),
@@ -105,7 +105,7 @@ def length(x, y, z):
 
 
 @triton.jit
-def chosen(condition, a, b):
+def select(condition, a, b):
     """Return a where the condition holds, else b."""
     return tl.where(condition, a[0], b[0]), tl.where(condition, a[1], b[1]), tl.where(condition, a[2], b[2])
 

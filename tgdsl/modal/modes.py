@@ -118,8 +118,7 @@ def loudness(
     Modes whose frequencies are nearer than `MERGE_TOLERANCE` are one. A square plate, a can or a ball has pairs and multiplets
     that symmetry makes equal, and any mixture of them is a mode too. Results for a group are the same for all mixtures. With φ
     the column of its mode shapes along the surface's normal and M = (1/A) ∫ φ φᵀ dA their mean products over it, an impulse J
-    at the point x makes all of them ring in phase, at amplitudes φ(x) J; the root mean square over the surface of what is then
-    heard is
+    at the point x makes all of them ring in phase, at amplitudes φ(x) J. The root mean square of the sound over the surface is
 
         √(φᵀ(x) M φ(x)) J,   and its root mean square over all x   g J,   g = ‖M‖ = √(Σ M_ij²)
 

@@ -1,4 +1,4 @@
-"""What kinds ask of a scene, one file each (see `base`): tgdsl's, those of installed packages, and those a caller gives.
+"""Quantities that kinds request from a scene, one file each (see `base`): from tgdsl, installed packages or the caller.
 
 A package brings a quantity by an entry point, in its pyproject.toml:
 

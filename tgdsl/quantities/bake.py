@@ -192,18 +192,18 @@ def geom_distance(felt: SurfaceGeom, options: DistanceOptions, margin: float, na
     _warn_of_hull(felt, margin, name)
     if options.query == "raycast":
         mesh = np.asarray(surface.vertices, np.float64), np.asarray(surface.faces, np.int64)
-        made = cache.cached_record(cache.digest(OUTER_FORMAT, mesh), lambda: outer(surface), Outer)
-        arrays = {"vertices": made.vertices, "faces": made.faces, "max_distance": np.asarray(2.0 * margin)}
-        found = GeomDistance(felt, "raycast", arrays, {})
+        baked = cache.cached_record(cache.digest(OUTER_FORMAT, mesh), lambda: outer(surface), Outer)
+        arrays = {"vertices": baked.vertices, "faces": baked.faces, "max_distance": np.asarray(2.0 * margin)}
+        result = GeomDistance(felt, "raycast", arrays, {})
     else:
-        made = bake(surface, margin, options.tolerance, options.max_bytes)
-        arrays = {"values": made.values, "origin": made.origin, "cell": np.asarray(made.cell)}
-        accuracy = {key: float(value) for key, value in dataclasses.asdict(made.errors).items()}
-        limits = {"tolerance": options.tolerance, "cell": made.cell}
-        found = GeomDistance(felt, made.method, arrays, {**accuracy, **limits})
-    for flaw in made.flaws:
+        baked = bake(surface, margin, options.tolerance, options.max_bytes)
+        arrays = {"values": baked.values, "origin": baked.origin, "cell": np.asarray(baked.cell)}
+        accuracy = {key: float(value) for key, value in dataclasses.asdict(baked.errors).items()}
+        limits = {"tolerance": options.tolerance, "cell": baked.cell}
+        result = GeomDistance(felt, baked.method, arrays, {**accuracy, **limits})
+    for flaw in baked.flaws:
         warnings.warn(f"{name}: {felt.geom.shown} {flaw}", stacklevel=2)
-    return found
+    return result
 
 
 def geom_table(cases: Sequence[Sequence[GeomDistance]]) -> GeomTable[np.ndarray]:
@@ -286,6 +286,6 @@ def _warn_of_hull(felt: SurfaceGeom, margin: float, name: str) -> None:
     if depth > margin:
         warnings.warn(
             f"{name}: MuJoCo collides the convex hull of {felt.geom.shown}, up to {1e3 * depth:.1f} mm off the mesh, "
-            "and that hull is felt; `surface` names what to feel instead",
+            "and taxels feel that hull; `surface` names another geometry to feel",
             stacklevel=2,
         )

@@ -207,7 +207,7 @@ class Quantity(ABC):
         return tuple(self.gather_use(use, scene) for use in part.uses)
 
     def gather_use(self, part: Any, scene: Scene) -> Any:
-        """Return the value of one use, of its own part: see `plan_use`."""
+        """Return the value of one use from its part: see `plan_use`."""
         raise NotImplementedError
 
     @abstractmethod

@@ -299,10 +299,10 @@ def search(
 
 
 def deepest(pairs: Pairs, probes: Probes, targets: Sequence[Target], known: Mapping[str, Tensor], reach: Reach) -> Deepest:
-    """Return what the probes are deepest in, the first of equals; `known` as `search` has it, the pairs' gate holds."""
+    """Return each probe's deepest penetration, the first of equals; `known` as in `search`, the pairs' gate holds."""
     pairs_of = torch.stack([pair - target.object.first_pair for pair, target in zip(known["pair"], targets, strict=True)])
     near = measure(pairs, Probes(probes.pos, pairs_of), targets)
-    # What moves along x by the number of its pair tells which pair is felt.
+    # Each pair moves along x by its number, so the velocity found identifies the deepest pair.
     number = torch.arange(1, pairs.offset[0].shape[1] + 1, dtype=reach.dtype, device=reach.device).expand_as(pairs.offset[0])
     still = torch.zeros_like(number)
     motion = Motion((number, still, still), (still, still, still), (still, still, still))
@@ -314,8 +314,8 @@ def deepest(pairs: Pairs, probes: Probes, targets: Sequence[Target], known: Mapp
 def _by_kernel(pairs: Pairs, probes: Probes, targets: Sequence[Target], known: Mapping[str, Tensor], reach: Reach) -> Deepest:
     from tgdsl.quantities.deepest_kernel import find
 
-    made = () if "geoms" in known else geom_tables([target.geoms for target in targets])
-    spheres, geoms = made or (known["spheres"], known["geoms"])
+    built = () if "geoms" in known else geom_tables([target.geoms for target in targets])
+    spheres, geoms = built or (known["spheres"], known["geoms"])
     return Deepest(*find(pairs, probes.pos, known["pair"], spheres, geoms, reach))
 
 
@@ -413,9 +413,9 @@ class _ContactDepth(Quantity):
     name, request, part = "contact_depth", ContactDepth, ContactDepthPart
 
     def plan(self, planning: Planning, uses: Sequence[Use]) -> ContactDepthPart[np.ndarray]:
-        """Return the part of the Plan; an object whose mesh no grid within its budget suits is a mistake."""
-        made = {name: _table(planning, name, uses) for name in planning.sensed}
-        tables = {name: table for name, table in made.items() if table is not None}
+        """Return the part of the Plan; report each object whose mesh no grid within its budget fits."""
+        all_tables = {name: _table(planning, name, uses) for name in planning.sensed}
+        tables = {name: table for name, table in all_tables.items() if table is not None}
         groups: dict[int, list[Use]] = {}
         for use in uses:
             groups.setdefault(id(use.pos), []).append(use)
@@ -550,9 +550,9 @@ def _query(
     planning: Planning, number: int, uses: Sequence[Use], tables: Mapping[str, GeomTable]
 ) -> tuple[ProbeQuery[np.ndarray], list[DepthUse[np.ndarray]]]:
     """Return the query of uses at the same probes, and the uses' parts."""
-    known, taxels = [target.name for target in planning.objects], uses[0].taxels
+    names_of_objects, taxels = [target.name for target in planning.objects], uses[0].taxels
     radius, bodies, result = planning.layout.radius[taxels], planning.bodies_of(taxels), []
-    felt_by = [[n for n in use.request.objects if n in known and use.request.wants_distance(radius)] for use in uses]
+    felt_by = [[n for n in use.request.objects if n in names_of_objects and use.request.wants_distance(radius)] for use in uses]
     felt = list(dict.fromkeys(name for names in felt_by for name in names))
     pair = planning.pair_table(felt, taxels)
     for use, names in zip(uses, felt_by, strict=True):
@@ -562,7 +562,7 @@ def _query(
         reach = np.where(can_meet.reshape(len(names), len(bodies)), request.reach(radius), -np.inf)
         search = _search(planning, names, request.wants, pair[objects], tables)
         result.append(DepthUse(number, tuple(objects), request.is_gated, request.wants, use.radius_noise, reach, search))
-    return ProbeQuery(tuple(known.index(name) for name in felt), uses[0].pos, pair), result
+    return ProbeQuery(tuple(names_of_objects.index(name) for name in felt), uses[0].pos, pair), result
 
 
 def _search(

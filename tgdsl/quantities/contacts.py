@@ -28,10 +28,10 @@ DEFAULT_PATCH_SLOTS = 4  # the same of sensors that need the loads of pairs, or 
 class ContactPoints(NamedTuple):
     """Contacts on each body, in its frame; planes (env, body, contact), but `net` (env, body). Unused slots are all zero.
 
-    Contacts beyond the slots have no place of their own. What a pair's slots lack of its whole force, r = f_net − Σ_c f_c, acts
-    at the centre of the contacts shown, weighted by their forces: each takes r |f_c| / Σ_c |f_c| on itself, or equal shares
-    where none has a force. The forces then sum to the whole; the moment of r about that centre is not known, nor are torques
-    beyond the slots. Where no contact is shown there is nowhere to act, and `net` alone has r.
+    Contacts beyond the slots have no slot. A pair's remaining force, r = f_net − Σ_c f_c, acts at the force-weighted centre of
+    the contacts in slots: each gets r |f_c| / Σ_c |f_c| in addition, or an equal share where none has a force. The forces then
+    sum to the net force; the moment of r about that centre is unknown, as are torques beyond the slots. A pair without a
+    contact in its slots has r in `net` alone.
     """
 
     pos: Vec  # contact points [m]
@@ -283,8 +283,8 @@ class LoadsPart(Generic[Array]):
 
 
 def _loads(use: LoadsUse[Tensor], state: Mapping[str, Tensor], dtype: torch.dtype) -> PairLoads:
-    found = pair_contacts(state, use.pairs)
-    pressed = planes.dot(found.force, found.normal).clamp(min=0.0)
+    contacts = pair_contacts(state, use.pairs)
+    pressed = planes.dot(contacts.force, contacts.normal).clamp(min=0.0)
 
     def spread(parts: Sequence[Tensor], side: str) -> list[Tensor]:
         return [part[:, :, None, None] if side == "link" else part[:, None, :, None] for part in parts]
@@ -294,13 +294,13 @@ def _loads(use: LoadsUse[Tensor], state: Mapping[str, Tensor], dtype: torch.dtyp
         return planes.vec(spread(planes.split(state[name].index_select(1, bodies)), side))
 
     def away(side: str) -> Vec:  # from the body's origin to each contact [m]
-        return planes.vec(torch.where(found.is_used, part, 0.0) for part in planes.sub(found.pos, of("body_pos", side)))
+        return planes.vec(torch.where(contacts.is_used, part, 0.0) for part in planes.sub(contacts.pos, of("body_pos", side)))
 
     def velocity(side: str) -> Vec:  # of the body's material at each contact [m/s]
         return planes.add(of("body_linvel", side), planes.cross(of("body_angvel", side), away(side)))
 
     apart = planes.sub(velocity("object"), velocity("link"))
-    across = planes.sub(apart, planes.scale(planes.dot(apart, found.normal), found.normal))
+    across = planes.sub(apart, planes.scale(planes.dot(apart, contacts.normal), contacts.normal))
     speed = planes.safe_sqrt(planes.dot(across, across))
     force, sliding = pressed.sum(dim=-1), (pressed * speed).sum(dim=-1)
     if not use.center:
@@ -310,7 +310,7 @@ def _loads(use: LoadsUse[Tensor], state: Mapping[str, Tensor], dtype: torch.dtyp
     rotation = planes.rot(spread(planes.rotation(quat), use.center))
     center, normal = (
         [(share * part).sum(dim=-1) for part in planes.rotate_back(rotation, vector)]
-        for vector in (away(use.center), found.normal)
+        for vector in (away(use.center), contacts.normal)
     )
     sign = 1.0 if use.center == "link" else -1.0
     center, along = planes.vec(c.to(dtype) for c in center), planes.vec((sign * n).to(dtype) for n in normal)

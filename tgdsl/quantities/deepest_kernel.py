@@ -19,7 +19,7 @@ from torch.library import triton_op, wrap_triton
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.geometry.shapes import COLUMNS
-from tgdsl.geometry.shapes_kernel import TIE, chosen, distance_to, dot, gradient_of, is_any, length, loaded, rotate, rotate_back
+from tgdsl.geometry.shapes_kernel import TIE, distance_to, dot, gradient_of, is_any, length, loaded, rotate, rotate_back, select
 from tgdsl.quantities.pairs import Pairs
 
 # Only Triton's compiler knows the types in a kernel.
@@ -150,10 +150,10 @@ def deepest_kernel(
         row = tl.maximum(winner, 0) * ROW
         kind = tl.load(geoms + row + KIND)
         turn = loaded(sizes + row + ROTATION)
-        local = chosen(kind < 0, rotate_back(turn, _from(point, sizes + row + POS)), point)
+        local = select(kind < 0, rotate_back(turn, _from(point, sizes + row + POS)), point)
         outward = gradient_of(tl.abs(kind), sizes + row, local)
-        outward = chosen(kind < 0, rotate(turn, outward), outward)
-        normal = chosen(met >= 0, rotate_back(rotation, outward), normal)
+        outward = select(kind < 0, rotate(turn, outward), outward)
+        normal = select(met >= 0, rotate_back(rotation, outward), normal)
     plane = tl.cast(num_points, tl.int64)
     tl.store(normal_out + out, normal[0], is_probe)
     tl.store(normal_out + plane + out, normal[1], is_probe)

@@ -19,7 +19,7 @@ from torch.library import triton_op, wrap_triton
 
 from tgdsl.geometry.grid import Grid
 from tgdsl.geometry.planes import Vec, vec
-from tgdsl.geometry.shapes_kernel import TIE, chosen, direction, is_any, loaded, rotate, rotate_back
+from tgdsl.geometry.shapes_kernel import TIE, direction, is_any, loaded, rotate, rotate_back, select
 from tgdsl.quantities.geoms import Geoms
 from tgdsl.quantities.pairs import Pairs
 
@@ -81,7 +81,7 @@ def _meet(
 
 @triton.jit
 def depth_kernel(
-    found, xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz, gates, pairs, points, frames, counts, values,
+    result, xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz, gates, pairs, points, frames, counts, values,
     num_links, num_points, turn_env, turn_pair, offset_env, offset_pair, gate_env, gate_pair, point_axis, point_env,
     IS_GATED: tl.constexpr, IS_CUBIC: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -94,21 +94,21 @@ def depth_kernel(
     grid = surface(frames, counts, values, link)
     points += env * point_env
     plane = (tl.num_programs(0).to(tl.int64)) * num_points
-    found += tl.program_id(0).to(tl.int64) * num_points
+    result += tl.program_id(0).to(tl.int64) * num_points
     for start in range(0, num_points, BLOCK):
         point = start + tl.arange(0, BLOCK)
         is_point = point < num_points
         here = placed(pose, points, point_axis, point, is_point)
-        tl.store(found + point, here[0], is_point)
-        tl.store(found + plane + point, here[1], is_point)
-        tl.store(found + 2 * plane + point, here[2], is_point)
+        tl.store(result + point, here[0], is_point)
+        tl.store(result + plane + point, here[1], is_point)
+        tl.store(result + 2 * plane + point, here[2], is_point)
         distance, gradient = outside(here)
         if is_open:
             distance, gradient = measured(grid, here, is_point, IS_CUBIC)
-        tl.store(found + 3 * plane + point, distance, is_point)
-        tl.store(found + 4 * plane + point, gradient[0], is_point)
-        tl.store(found + 5 * plane + point, gradient[1], is_point)
-        tl.store(found + 6 * plane + point, gradient[2], is_point)
+        tl.store(result + 3 * plane + point, distance, is_point)
+        tl.store(result + 4 * plane + point, gradient[0], is_point)
+        tl.store(result + 5 * plane + point, gradient[1], is_point)
+        tl.store(result + 6 * plane + point, gradient[2], is_point)
 
 
 @triton.jit
@@ -183,8 +183,8 @@ def measured(grid, here, is_point, IS_CUBIC: tl.constexpr):
     if is_any(is_in):
         value, slope = _interpolated(nodes, at, num, TIE / cell, is_in, IS_CUBIC)
         distance = tl.where(is_in, value, distance)
-        slope = chosen(value != value, gradient, (slope[0] / cell, slope[1] / cell, slope[2] / cell))
-        gradient = chosen(is_in, rotate(turn, direction(slope[0], slope[1], slope[2])), gradient)
+        slope = select(value != value, gradient, (slope[0] / cell, slope[1] / cell, slope[2] / cell))
+        gradient = select(is_in, rotate(turn, direction(slope[0], slope[1], slope[2])), gradient)
     return distance, gradient
 
 

@@ -70,12 +70,12 @@ def union_distance(point: Vec, frames: Sequence[Frame | None], geoms: Geoms) -> 
 
     `frames` say how each geom sees the points; None: they are in its frame already.
     """
-    found = []
+    results = []
     for g, frame in enumerate(frames):
         here = point if frame is None else planes.add(planes.rotate(frame.rotation, point), frame.offset)
         distance, gradient = _to_geom(here, geoms, g)
-        found.append((distance, gradient if frame is None else planes.rotate_back(frame.rotation, gradient)))
-    return united(found, geoms.is_absent)
+        results.append((distance, gradient if frame is None else planes.rotate_back(frame.rotation, gradient)))
+    return united(results, geoms.is_absent)
 
 
 def united(geoms: Iterable[tuple[Tensor, Vec]], is_absent: Bool[Tensor, "case geom"] | None) -> tuple[Tensor, Vec]:
@@ -233,7 +233,7 @@ class ReferenceGeom:
 
 
 def geoms_of(table: GeomTable[np.ndarray], case: int, size: Float[np.ndarray, " 3"] | None = None) -> list[ReferenceGeom]:
-    """Return the geoms of a case of a table; a size replaces that of its only geom [m]."""
+    """Return the geoms of a case of a table; `size` replaces its only geom's size [m]."""
     results = []
     for g, shape in enumerate(table.shapes):
         if table.is_absent is None or not table.is_absent[case, g]:

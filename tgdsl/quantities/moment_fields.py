@@ -146,11 +146,11 @@ class Truth(NamedTuple):
 def _bake(geoms: Sequence[SurfaceGeom], radius: float, limits: Limits, with_slope: bool) -> BakedField:
     tolerance, gradient_tolerance, budget = limits
     least = 4.0 if gradient_tolerance is None else float(np.clip(1 / gradient_tolerance, 4, GRADIENT_FINENESS))
-    # The error of S1 is that of the quadrature, some (0.25 / k)² of spacings R/k, and that of the lattice.
+    # The error of S1 is the quadrature's, about (0.25 / k)² for spacings R/k, plus the lattice's.
     spacing = radius / float(np.clip(0.55 / np.sqrt(tolerance), least, 24))
     channels = 8 if with_slope else 4
-    # The error falls as the square of the cell or faster: a coarse lattice, some 0.4 (h/R)², tells how fine to be. That of
-    # S0's gradients falls as the cell: some 0.17 h/R.
+    # The error falls as the square of the cell or faster: about 0.4 (h/R)² on a coarse lattice, which gives the cell. The error
+    # of S0's gradients falls as the cell: about 0.17 h/R.
     cell = radius * float(np.clip(2 * np.sqrt(tolerance / 0.4), 0.05, 0.5))
     cell = cell if gradient_tolerance is None else min(cell, radius * gradient_tolerance / 0.17)
     # Before anything is summed: what a budget holds also bounds how many pieces there are.

@@ -118,7 +118,7 @@ def plane_moments(point: Vec, radius: Tensor) -> Moments:
 def cloud_moments(point: Vec, cloud: PointCloud, radius: Tensor) -> Moments:
     """Return the sums over the points of a cloud; zero outside its lattice, not-a-number for a point that is none.
 
-    `point` is in the object's frame [m]; `radius` is at most that of the lists [m].
+    `point` is in the object's frame [m]; `radius` is at most the lists' radius [m].
     """
     base, rest = _cell_of(point, cloud.origin, cloud.cell, cloud.num, last=1)
     is_outside = (rest[0] < 0) | (rest[1] < 0) | (rest[2] < 0) | (rest[0] > 1) | (rest[1] > 1) | (rest[2] > 1)
@@ -162,7 +162,7 @@ class SurfaceMoments(NamedTuple):
 class MomentsRequest(Request[SurfaceMoments]):
     """Asks for moments of objects' surfaces around probes. They are never gated."""
 
-    radius: float | None = None  # sensing radius of all active probes [m]; None: that of each in the layout
+    radius: float | None = None  # sensing radius of all active probes [m]; None: each probe's radius in the layout
     # "field": from a baked field; "points": by a sum over sampled points. Planes are exact in both.
     backend: Literal["field", "points"] = "field"
     num_points: int = 5000  # points of each object

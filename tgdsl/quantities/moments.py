@@ -207,10 +207,10 @@ class _Moments(Quantity):
             moments, motions, areas, pos = {}, {}, {}, vec(use.pos.unbind())
             for k, i in enumerate(use.tables):
                 source = _source(part.tables[i], use, k, scene)
-                name, own = source.target.name, source.target.pairs
-                moments[name], areas[name] = FELT_MOMENTS(pairs, own, pos, source), source.area
+                name, own_pairs = source.target.name, source.target.pairs
+                moments[name], areas[name] = FELT_MOMENTS(pairs, own_pairs, pos, source), source.area
                 if use.motion and pairs.motion is not None:
-                    motions[name] = Motion(*(gathered(part, own, source.pair) for part in pairs.motion))
+                    motions[name] = Motion(*(gathered(part, own_pairs, source.pair) for part in pairs.motion))
             none = pairs.offset[0].new_zeros((pairs.offset[0].shape[0], pos[0].shape[0]))
             results.append(SurfaceMoments(pos, none, moments, motions, areas))
         return tuple(results)

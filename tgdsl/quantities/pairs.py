@@ -90,8 +90,8 @@ def relate(
     fields = (quat, pos, *velocities)
     parts = _related(*(field.index_select(1, bodies) for bodies in (link, target) for field in fields))
     is_moving = len(parts) > 12
-    parts += [] if gate is None else [gate + 0.0 * parts[9]]  # of the same numbers, so that it is formed beside the others
-    # Stacked, they are stored once per pair; a compiler that fuses would else form them again for every taxel.
+    parts += [] if gate is None else [gate + 0.0 * parts[9]]  # depends on the same numbers, so one kernel forms it too
+    # Stack, to materialise them once per pair: fusion would recompute them for every taxel.
     parts = torch.stack(parts, dim=1).to(dtype).unbind(1)
     motion = Motion(planes.vec(parts[12:15]), planes.vec(parts[15:18]), planes.vec(parts[18:21])) if is_moving else None
     return Pairs(planes.rot(parts[:9]), planes.vec(parts[9:12]), motion, None if gate is None else parts[-1])

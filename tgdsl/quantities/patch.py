@@ -147,7 +147,7 @@ def patch_area(away: Sequence[Vec], normal: Vec, is_used: Sequence[Tensor], is_s
 
 
 def _with_angles(flat: Sequence[tuple[Tensor, Tensor]], is_used: Sequence[Tensor]) -> list[Point]:
-    """Return points with their angles from that of largest x; points that do not count come last, at its place."""
+    """Return points with their angles around the point of largest x; unused points come last, at its position."""
     start_x, start_y = torch.full_like(flat[0][0], -torch.inf), torch.zeros_like(flat[0][0])
     for (x, y), used in zip(flat, is_used, strict=True):
         is_farther = used & (x > start_x)

@@ -130,9 +130,9 @@ class HeatOfObjects(NamedTuple):
 class ContactPatch(NamedTuple):
     """Patches between each body and each object, planes (env, body, object); all zero where they do not touch.
 
-    Contacts count where their normal force is positive. The centre is that of these contacts, and the normal the direction of
-    the sum of their normals, both weighted by normal force; where the normals cancel, as of a link that is pinched from two
-    sides, that of the first of them.
+    Contacts count where their normal force is positive. The centre is their mean position, and the normal the direction of the
+    sum of their normals, both weighted by normal force. Where the normals cancel, as when a link is pinched from two sides, it
+    is the first contact's normal.
     """
 
     force: Tensor  # sum of the contacts' normal forces [N]
@@ -216,7 +216,7 @@ def tables(
     faces: Sequence[str] = FACES,
     loss: Float[np.ndarray, "row 3"] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Return what a step needs of boxes with so many cells along each axis, of sizes [m], some faces of which are exposed.
+    """Return the tables of a step for boxes, from the numbers of cells along each axis, sizes [m] and exposed faces.
 
     `count`, `number` and `volume` of cells; by axis `ends`, how many exposed faces across it a cell has, `mode`, the modes,
     their eigenvalues `square`, `smooth` with (kπ/n)² instead of 4 sin²(kπ/2n) in them, and the modes' sums over the cells
@@ -332,7 +332,7 @@ def _use(planning: Planning, use: Use) -> PatchesUse[np.ndarray]:
     shapes = [np.stack([heat.volume, heat.area, heat.curvature], axis=1).tolist() for heat in heats]
     count = np.array([topology.cells[i] for i in topology.grids], dtype=np.int64).reshape(-1, 3)
     size = np.array([heats[i].box_size[0] for i in topology.grids], dtype=np.float64).reshape(-1, 3)
-    told = [name in planning.heated and (h.is_per_env or len(h.materials) > 1) for name, h in zip(names, heats, strict=True)]
+    varied = [name in planning.heated and (h.is_per_env or len(h.materials) > 1) for name, h in zip(names, heats, strict=True)]
     return PatchesUse(
         topology=topology,
         is_star=use.request.is_star,
@@ -346,7 +346,7 @@ def _use(planning: Planning, use: Use) -> PatchesUse[np.ndarray]:
         shapes=_padded(shapes, 3),
         grids=np.array([_grid(heat) for heat in heats]).reshape(-1, 2, 3),
         variants=tuple(-1 if target is None or target.num_variants == 1 else target.varied for target in objects),
-        heated=tuple(planning.heated.index(name) if is_told else -1 for name, is_told in zip(names, told, strict=True)),
+        heated=tuple(planning.heated.index(name) if varies else -1 for name, varies in zip(names, varied, strict=True)),
         has_own_start=tuple(heat.is_per_env for heat in heats),
         num_materials=tuple(len(heat.materials) for heat in heats),
         sides=topology.tables(),
@@ -422,17 +422,17 @@ def _objects(use: PatchesUse[Tensor], scene: Scene) -> HeatOfObjects:
             temperatures[:, place] if is_own else None for place, is_own in zip(use.heated, use.has_own_start, strict=True)
         ]
         start = torch.stack([start[:, i].expand(len(temperatures)) if c is None else c for i, c in enumerate(columns)], dim=1)
-    material_id = _chosen(materials, scene.tensors.get("object_material"), use.heated, use.num_materials)
+    material_id = _select(materials, scene.tensors.get("object_material"), use.heated, use.num_materials)
     counts = tuple(2 if place >= 0 else 1 for place in use.variants)
-    shaped = _chosen(shapes, scene.tensors.get("variant"), use.variants, counts)
+    shaped = _select(shapes, scene.tensors.get("variant"), use.variants, counts)
     grids = use.grids.to(scene.dtype)
     corner, size = (planes.vec(grids[:, i, axis] for axis in range(3)) for i in range(2))
     made_of: Any = (*material_id.unbind(-1), *shaped.unbind(-1))
     return HeatOfObjects(start, use.has_start.to(scene.dtype)[None], *made_of, size=size, corner=corner)
 
 
-def _chosen(values: Tensor, which: Tensor | None, places: tuple[int, ...], counts: tuple[int, ...]) -> Tensor:
-    """Return values (1, object, choice, n) as (env, object, n), of the choice that each environment has."""
+def _select(values: Tensor, which: Tensor | None, places: tuple[int, ...], counts: tuple[int, ...]) -> Tensor:
+    """Return values (1, object, choice, n) as (env, object, n): each environment's choice."""
     if which is None or not any(count > 1 and place >= 0 for place, count in zip(places, counts, strict=True)):
         return values[:, :, 0]
     columns = []
@@ -556,8 +556,8 @@ class _Patches(Quantity):
         pairs, is_star = use_part.pairs, use_part.is_star
         patches = {(b, o): _reference_patch(scene, b, int(pairs[b, o]), is_star) for b, o in use_part.topology.met}
         objects = tuple(_reference_object(use_part, i, scene) for i in range(use_part.topology.num_objects))
-        kept = {pair: patch for pair, patch in patches.items() if patch is not None}
-        return ReferencePatches(kept, objects, use_part.topology, use_part.boxes)
+        touching = {pair: patch for pair, patch in patches.items() if patch is not None}
+        return ReferencePatches(touching, objects, use_part.topology, use_part.boxes)
 
     def fields(self, part: PatchesPart) -> set[str]:
         names = {"object_temperature"} if any(any(use.has_own_start) for use in part.uses) else set()

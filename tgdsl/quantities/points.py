@@ -205,7 +205,7 @@ class _Points(Quantity):
     def gather(self, part: PointsPart[Tensor], scene: Scene) -> tuple[dict[str, ObjectPoints], ...]:
         results = []
         for use in part.uses:
-            pairs, found = pairs_for(scene, use.is_gated), {}
+            pairs, points_of = pairs_for(scene, use.is_gated), {}
             if pairs.gate is not None:
                 lost = pairs.gate.clamp(min=0.0)  # zero where it is a number: else the points are nowhere
                 pairs = pairs._replace(offset=planes.vec(part + lost for part in pairs.offset))
@@ -218,8 +218,8 @@ class _Points(Quantity):
                 assert part.surfaces is not None
                 where, links = vec(points[:, :, None].unbind()), geoms_of_cases(part.surfaces, met.link)
                 source = PointSource(target.name, met.pair, met.taxels, met.tiles, where, area[:, None], links)
-                found[target.name] = ObjectPoints(pairs, source)
-            results.append(found)
+                points_of[target.name] = ObjectPoints(pairs, source)
+            results.append(points_of)
         return tuple(results)
 
     def reference(self, part: PointsPart[np.ndarray], use: int, scene: ReferenceScene) -> tuple[ReferencePoints, ...]:

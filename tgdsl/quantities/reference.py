@@ -62,8 +62,8 @@ class ReferenceScene:
 
     def is_touching(self, link: str, target: str) -> bool:
         """Return whether the simulator has a link's body in contact with an object."""
-        found, pair = self.fields.get("contact_found"), Pair(link, target)
-        return found is not None and pair in self.contact_pairs and bool(found[self.contact_pairs.index(pair)] > 0)
+        counts, pair = self.fields.get("contact_found"), Pair(link, target)
+        return counts is not None and pair in self.contact_pairs and bool(counts[self.contact_pairs.index(pair)] > 0)
 
     def variant(self, target: PairedObject) -> int:
         """Return which of its variants an object has."""

@@ -21,7 +21,7 @@ import triton.language as tl
 from torch import Tensor
 
 from tgdsl.geometry import planes
-from tgdsl.geometry.shapes_kernel import chosen, dot
+from tgdsl.geometry.shapes_kernel import dot, select
 from tgdsl.quantities.depth_kernel import cells, is_felt, is_within, measured, nearest, outside, placed, posed, surface
 
 LANES, CHUNK = 32, 512  # threads of a program, which is one warp, and most points of a chunk
@@ -173,11 +173,11 @@ def _advanced(point, is_point, here, distance, gradient, stick_slip, state, SLID
     depth = tl.maximum(standoff - distance, 0.0, propagate_nan=tl.PropagateNan.ALL)
     none = tl.zeros_like(depth)
     way = (here[0] - anchor[0], here[1] - anchor[1], here[2] - anchor[2])
-    moved = chosen(is_held, way, (none, none, none))
+    moved = select(is_held, way, (none, none, none))
     if SLIDES:
         moved, anchor = _slid(moved, anchor, gradient, slip * depth)
     is_taken = (is_held == 0) & (standoff - distance > enter) & is_point
-    new_anchor = chosen(is_held, anchor, chosen(is_taken, here, (none, none, none)))
+    new_anchor = select(is_held, anchor, select(is_taken, here, (none, none, none)))
     is_changed = held_before | is_taken
     tl.store(anchor_x + point, new_anchor[0], is_changed)
     tl.store(anchor_y + point, new_anchor[1], is_changed)
@@ -201,5 +201,5 @@ def _slid(moved, anchor, normal, limit):
     slides = square > tl.maximum(limit * limit, TINY, propagate_nan=tl.PropagateNan.ALL)
     rest = 1.0 - limit / tl.sqrt(tl.where(slides, square, 1.0))
     slid = (rest * x, rest * y, rest * z)
-    moved = chosen(slides, (moved[0] - slid[0], moved[1] - slid[1], moved[2] - slid[2]), moved)
-    return moved, chosen(slides, (anchor[0] + slid[0], anchor[1] + slid[1], anchor[2] + slid[2]), anchor)
+    moved = select(slides, (moved[0] - slid[0], moved[1] - slid[1], moved[2] - slid[2]), moved)
+    return moved, select(slides, (anchor[0] + slid[0], anchor[1] + slid[1], anchor[2] + slid[2]), anchor)
