@@ -220,4 +220,4 @@ def test_arrays_that_were_tampered_with(artifact, tmp_path):
         half,
     ):
         (tmp_path / "bad.safetensors").write_bytes(save(bad, header))
-        assert refused(tmp_path / "bad.safetensors") == "the arrays are not those that the plan was written with"
+        assert refused(tmp_path / "bad.safetensors") == "the arrays differ from the arrays that the plan was written with"

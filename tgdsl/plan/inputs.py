@@ -114,7 +114,7 @@ class Inputs:
             StateError: If `names` has a name that is not among these.
         """
         names = names or {}
-        parts = [part for own in (*self.contacts_of.values(), *self.link_parts.values()) for part in own]
+        parts = [part for geoms in (*self.contacts_of.values(), *self.link_parts.values()) for part in geoms]
         bodies = {*self.bodies, *self.bodies_of.values(), *(pair.link for pair in self.pairs)}
         names_here = {*bodies, *self.joints, *self.actuators, *(part.name for part in parts)}
         if unknown := [name for name in names if name not in names_here]:
@@ -124,8 +124,8 @@ class Inputs:
         def there(name: str) -> str:
             return names.get(name, name if name == "world" else prefix + name)
 
-        def parts_there(own: tuple[ContactPart, ...]) -> tuple[ContactPart, ...]:
-            return tuple(ContactPart(part.kind, there(part.name)) for part in own)
+        def parts_there(geoms: tuple[ContactPart, ...]) -> tuple[ContactPart, ...]:
+            return tuple(ContactPart(part.kind, there(part.name)) for part in geoms)
 
         return dataclasses.replace(
             self,
@@ -134,8 +134,8 @@ class Inputs:
             bodies_of={name: there(body) for name, body in self.bodies_of.items()},
             joints=tuple(there(name) for name in self.joints),
             actuators=tuple(there(name) for name in self.actuators),
-            contacts_of={name: parts_there(own) for name, own in self.contacts_of.items()},
-            link_parts={there(link): parts_there(own) for link, own in self.link_parts.items()},
+            contacts_of={name: parts_there(geoms) for name, geoms in self.contacts_of.items()},
+            link_parts={there(link): parts_there(geoms) for link, geoms in self.link_parts.items()},
         )
 
     def __repr__(self) -> str:

@@ -35,7 +35,7 @@ that breaks old files converts them in `Plan.from_json`."""
 
 @dataclass(frozen=True)
 class Origin:
-    """What a plan was made from; its resolution is empty if it has no layout."""
+    """Sources of a plan; its resolution is empty if it has no layout."""
 
     document_sha256: str
     robot: str
@@ -45,7 +45,7 @@ class Origin:
 
     @property
     def at_resolution(self) -> str:
-        """What follows on a number of taxels, or a robot, in an account of it."""
+        """Suffix for a number of taxels, or a robot, in a report."""
         return f" at resolution {self.resolution}" if self.resolution else ""
 
 
@@ -53,17 +53,17 @@ class Origin:
 class Plan:
     """All a module is built from."""
 
-    origin: Origin  # what it was made from
-    inputs: Inputs  # what it reads
+    origin: Origin  # its sources
+    inputs: Inputs  # the fields of the scene that it reads
     layout: Layout  # the taxels of all sensors
     objects: tuple[PairedObject, ...]  # what taxels feel
     pairs: PairTable[np.ndarray]  # the (link, object) pairs that may meet, in the order of the objects
-    quantities: Mapping[str, Any]  # what sensors ask of the scene: each quantity's own part, by its name, in their order
+    quantities: Mapping[str, Any]  # sensors' requests to the scene: each quantity's part, by its name, in their order
     sensors: tuple[PlannedSensor[np.ndarray], ...]  # sensors, in the document's order
     proprioception: tuple[PlannedReading, ...]  # fields of joints and actuators that are readings too
     observations: tuple[PlannedObservation[np.ndarray], ...]  # observation terms, in the document's order
     dropped: tuple[tuple[str, str], ...]  # what the scene or the document has and the module does not need, and why
-    unfelt: tuple[Unfelt, ...]  # taxels that cannot feel what their sensors are to feel, and why
+    unfelt: tuple[Unfelt, ...]  # taxels that cannot reach anything their sensors feel, and why
     scene: SceneFile  # the instrumented scene
 
     @cached_property
@@ -78,22 +78,22 @@ class Plan:
         return taxels_id(self.layout)
 
     def layout_of(self, sensor: PlannedSensor) -> Layout:
-        """Return the taxels of one sensor; of one that has none, its links."""
+        """Return the taxels of one sensor, or its links if it has no taxels."""
         if not len(sensor.taxels):
             return Layout.of_links(sensor.links, self.layout.groups)
         return self.layout.take(sensor.taxels)
 
     def readings(self) -> dict[str, PlannedReading]:
-        """Return all readings by name, in the order in which they are handed out."""
+        """Return all readings by name, in the order of the module's output."""
         readings = {reading.name: reading for sensor in self.sensors for reading in sensor.readings}
         return readings | {reading.name: reading for reading in self.proprioception}
 
     def sensor_of(self, reading: str) -> PlannedSensor[np.ndarray]:
-        """Return the sensor that makes a reading."""
-        return next(sensor for sensor in self.sensors if reading in [own.name for own in sensor.readings])
+        """Return the sensor of a reading."""
+        return next(sensor for sensor in self.sensors if reading in [candidate.name for candidate in sensor.readings])
 
     def to_json(self) -> str:
-        """Return everything but the arrays, of which only names and a hash, with sorted keys."""
+        """Return the plan with sorted keys; arrays appear as names and one hash."""
         plain = tree.flatten(self._parts())[0] | {"format": FORMAT, "arrays": _digest(self.arrays), "taxels_id": self.taxels_id}
         return json.dumps(plain, sort_keys=True, ensure_ascii=False, separators=(",", ":"))
 
@@ -107,7 +107,7 @@ class Plan:
                 problem = f"plan format {version!r} is not {FORMAT}, which this version of tgdsl reads"
                 raise ArtifactError(f"{problem}; compile the document again")
             if digest != _digest(arrays):
-                raise ArtifactError("the arrays are not those that the plan was written with")
+                raise ArtifactError("the arrays differ from the arrays that the plan was written with")
             hints, requested = get_type_hints(Plan), plain.pop("quantities")
             values = {name: tree.restored(hints[name], part, arrays) for name, part in plain.items()}
             plan = Plan(**values, quantities=_quantities(requested, arrays, quantities))
@@ -120,7 +120,7 @@ class Plan:
 
 
 def _quantities(plain: Mapping[str, Any], arrays: Mapping[str, np.ndarray], known: Sequence[Quantity]) -> dict[str, Any]:
-    """Return the parts of quantities, each of its own type, in the order in which they are known."""
+    """Return the parts of quantities, each as its quantity's type, in the order of `known`."""
     part_of = {quantity.name: quantity.part for quantity in known}
     if missing := sorted(plain.keys() - part_of.keys()):
         hint = "give the kind that brings it, or install its package"

@@ -48,7 +48,7 @@ class Collider:
     size: tuple[float, ...]  # its size as MuJoCo defines it [m]
     pos: tuple[float, float, float]  # its frame's origin in the body's frame [m]
     quat: tuple[float, float, float, float]  # its orientation there, w, x, y, z
-    is_core: bool  # whether links that have colliders meet it too; the others meet what is no such link alone
+    is_core: bool  # whether it also collides with links that have colliders; the others do not
 
 
 @dataclass(frozen=True)

@@ -51,8 +51,8 @@ class PlannedReading:
 class PlannedMemory:
     """What a sensor carries from one call to the next: its value at rest, and its shape after the leading `env`.
 
-    With `past` it is a ring of what was so at each call of so many seconds before the present one, (env, call, *shape). What
-    is `overwritten` a kernel may write over in place.
+    With `past` [s] it is a ring of the values at all calls in that time before the present one, (env, call, *shape). A kernel
+    may write an `overwritten` memory in place.
     """
 
     rest: float
@@ -81,7 +81,7 @@ class PlannedHistory:
 
 @dataclass(frozen=True, eq=False)
 class PlannedSensor(Generic[Array]):
-    """One way to read a sensor: what is computed for it alone.
+    """One way to read a sensor: the computation that it does not share.
 
     A sensor that is read both clean and measured is computed once where noise comes after its equation, else twice.
     """
@@ -91,24 +91,24 @@ class PlannedSensor(Generic[Array]):
     kind: str
     links: tuple[Link, ...]  # the links that carry it
     taxels: Array  # its taxels, rows of the layout
-    uses: Mapping[str, int]  # what it asked for: by quantity the number of the use
+    uses: Mapping[str, int]  # index of its use, by quantity
     joined: tuple[str, ...]  # the sensors that are computed as one, in the order of the uses' rows; empty if it is alone
-    rows: tuple[int, int]  # which of the uses' rows are its own: the first, and one beyond the last
+    rows: tuple[int, int]  # its rows among the uses' rows: the first, and one beyond the last
     state: Mapping[str, PlannedMemory]  # what it carries from one call to the next: the kind's own, `noise/…` and `sample/…`
     signal: tuple[str, ...]  # channels of the signal that noise and sampling act on
     readings: tuple[PlannedReading, ...]  # its own, measured if it has noise; the clean one, if read too; reports
-    axes: tuple[PlannedAxis, ...]  # what their rows are, one for each
-    constants: Mapping[str, Array] = field(metadata=INLINE)  # what its kind folded
+    axes: tuple[PlannedAxis, ...]  # axis of each reading's rows
+    constants: Mapping[str, Array] = field(metadata=INLINE)  # constants of its kind
     noise: PlannedNoise[Array] | None  # its imperfections
     period: float  # time between its samples [s]; 0: it takes one at every call
-    history: PlannedHistory | None  # what is read of the last calls
-    notes: tuple[str, ...]  # what an account of it says of its parameters, line by line
-    is_timed: bool  # whether its kind wants to know when it is called: see `sensors.base.Context`
+    history: PlannedHistory | None  # how it combines the last calls
+    notes: tuple[str, ...]  # lines about its parameters in a report
+    is_timed: bool  # whether its kind needs the time of a call: see `sensors.base.Context`
     substeps: int  # physics steps of a call that it is advanced at; 0: once per call
     upstream: tuple[str, ...]  # sensors whose planes it reads, see `sensors.upstream`: they are evaluated before it
     provides: tuple[str, ...]  # planes that it has for others
-    is_random: bool  # whether its kind draws random numbers of its own
-    timestep: float  # time between the calls of its kind that its constants are made for [s]; 0: any will do
+    is_random: bool  # whether its kind draws random numbers
+    timestep: float  # time between calls that its constants assume [s]; 0: any
 
     @property
     def wants_clock(self) -> bool:
@@ -127,7 +127,7 @@ class PlannedSensor(Generic[Array]):
 
     @property
     def windows(self) -> tuple[PlannedReading, ...]:
-        """Those of its readings whose last calls are remembered."""
+        """Its readings that have a history."""
         return () if self.history is None or self.history.reduce == "last" else self.own_readings
 
 

@@ -1,7 +1,7 @@
 """Trees of frozen dataclasses with arrays as leaves: flattened to names once, in the artefact, and built again from them.
 
-A leaf's name is the path to it: names of fields, keys of mappings, of members of tuples their `key` or `name` or else their
-number. A mapping whose field says `inline` adds nothing of its own. An array that stands in several places has one name.
+A leaf's name is its path: names of fields, keys of mappings, and for members of tuples their `key`, `name` or number. A mapping
+whose field has the metadata `inline` adds no name to the path. An array that stands in several places has one name.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def flatten(value: Any, path: str = "") -> tuple[Any, dict[str, np.ndarray]]:
 def mapped(value: Any, change: Callable[[np.ndarray], Any], is_kept: Callable[[Any], bool] = lambda record: False) -> Any:
     """Return a tree with other leaves; a dataclass that `is_kept` keeps its arrays.
 
-    What has no array stays as it is. An array that stands in several places is changed once.
+    Parts without arrays stay the same objects. An array that stands in several places is changed once.
     """
     results: dict[int, Any] = {}
 

@@ -1,4 +1,4 @@
-"""Environments as users name them: by index, or by a mask over all of them; and masks beside what environments have."""
+"""Environments as users name them, by index or by a mask over all of them; and masked writes to tensors (env, …)."""
 
 from __future__ import annotations
 
@@ -30,18 +30,16 @@ def env_indices(env_ids: EnvIds | None, num_envs: int, error: type[TgdslError] =
     """
     if env_ids is None:
         return np.arange(num_envs)
-    found = np.asarray(_ids_tensor(env_ids, num_envs, error).cpu())
-    if found.dtype == bool and found.shape == (num_envs,):
-        return np.flatnonzero(found)
+    ids = np.asarray(_ids_tensor(env_ids, num_envs, error).cpu())
+    if ids.dtype == bool and ids.shape == (num_envs,):
+        return np.flatnonzero(ids)
     # Numbers of 8 bits are a mask that is not boolean rather than indices.
-    is_index = (
-        found.dtype.kind in "iu" and found.dtype.itemsize > 1 and found.ndim == 1 and ((found >= 0) & (found < num_envs)).all()
-    )
-    if found.size and not is_index:
-        is_mask = found.dtype == bool
-        seen = f"a mask of {' x '.join(map(str, found.shape))}" if is_mask else listed([str(value) for value in found.ravel()])
+    is_index = ids.dtype.kind in "iu" and ids.dtype.itemsize > 1 and ids.ndim == 1 and ((ids >= 0) & (ids < num_envs)).all()
+    if ids.size and not is_index:
+        is_mask = ids.dtype == bool
+        seen = f"a mask of {' x '.join(map(str, ids.shape))}" if is_mask else listed([str(value) for value in ids.ravel()])
         raise error(f"env_ids: found {seen}, {_expected_ids(num_envs)}")
-    return found.reshape(-1).astype(np.int64)
+    return ids.reshape(-1).astype(np.int64)
 
 
 def is_env_mask(env_ids: EnvIds, num_envs: int) -> bool:
@@ -74,7 +72,7 @@ def env_mask(
     error: type[TgdslError] = SimulationError,
     waits: bool = True,
 ) -> Bool[Tensor, " env"]:
-    """Return environments (default: all) as a mask on a device. A mask that is there already is taken as it is.
+    """Return environments (default: all) as a mask on a device. A mask on the device is returned without a copy.
 
     Indices on a GPU are checked on the host, which `waits` for them, or by the kernel, which asserts that they exist.
     """
@@ -94,7 +92,7 @@ def env_mask(
 
 
 def broadcast_over(mask: Bool[Tensor, " env"], values: Tensor) -> Bool[Tensor, "env ..."]:
-    """Return a mask over environments with as many axes as some values (env, …), of length 1 but for the first.
+    """Return a mask over environments with as many axes as `values` (env, …); all axes after the first have length 1.
 
     With `torch.where` or `masked_fill_` it then chooses whole environments.
     """
@@ -102,9 +100,9 @@ def broadcast_over(mask: Bool[Tensor, " env"], values: Tensor) -> Bool[Tensor, "
 
 
 def few_ids(mask: Bool[Tensor, " env"]) -> Int[Tensor, " n"] | None:
-    """Return the environments of a mask, if they are few enough on a CPU that what is done for them alone takes less.
+    """Return the environments of a mask, if they are so few that indexing them is faster than computing all.
 
-    None too where a mask's values are not to be looked at: see `may_be_nonempty`.
+    None on a GPU or under compilation, where the values must not be read: see `may_be_nonempty`.
     """
     if mask.is_cuda or torch.compiler.is_compiling():
         return None
@@ -133,13 +131,13 @@ def is_cheap_to_read(values: Tensor) -> bool:
 
 
 def may_be_nonempty(mask: Bool[Tensor, "*n"]) -> bool:
-    """Return whether a mask holds anywhere, or its values are not to be looked at: on a GPU, and where operations are followed.
+    """Return whether a mask holds anywhere, or its values must not be read: on a GPU, and where operations are followed.
 
-    What is done only where a mask holds can be left out if this is False; the result must be the same bytes.
+    If this is False, the masked operation can be skipped; the result must be the same bytes.
     """
     return is_out_of_sight(mask) or bool(mask.any())
 
 
 def is_out_of_sight(values: Tensor) -> bool:
-    """Return whether Python must not look at values: on a GPU, which it would wait for, and where operations are followed."""
+    """Return whether Python must not read values: on a GPU, where it would wait, and where operations are followed."""
     return values.is_cuda or torch.compiler.is_compiling() or is_followed()

@@ -14,10 +14,10 @@ T = TypeVar("T")
 
 
 class FusedCall(Generic[P, T]):
-    """A method whose first call is made as it stands; later ones are compiled, if that is wanted.
+    """A method whose first call runs eagerly; later calls are compiled, if `is_compiled`.
 
-    The first call makes what lasts: tensors that are copied from the host, hashes of names. Those that are compiled find them
-    there. What torch cannot compile of the method is done as it stands.
+    The first call fills caches, such as tensors copied from the host and hashes of names, for the compiled calls. Parts that
+    torch cannot compile run eagerly.
 
     The method may change tensors in place, but must not copy one that it changes afterwards as it is: after
     `before.copy_(now); now.copy_(new)` Inductor has `new` in both (https://github.com/pytorch/pytorch/issues/198131).

@@ -1,7 +1,7 @@
 """A matrix for each link that maps its taxels' values to each of its taxels: crosstalk, and the markers of a skin.
 
 Shapes: `line` environments, or environments and channels, `row` the taxels of all links, one link after the other, `from` and
-`to` those of one link, `plane` numbers that come out for each taxel.
+`to` the taxels of one link, `plane` outputs per taxel.
 """
 
 from __future__ import annotations

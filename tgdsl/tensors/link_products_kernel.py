@@ -33,7 +33,7 @@ DEPTH = 32
 NUM_PROGRAMS, MAX_STEPS = 768, 8
 """Programs that a GPU should have, three for each that an H200 runs at once, and most blocks of lines of a program.
 
-There should be many: those of small links end early.
+There should be many: programs of small links end early.
 """
 COLUMNS = tl.constexpr(5)
 """Of the table of tiles: the link's first row, its number of taxels, where its matrix begins, the tile's first taxel, plane."""
@@ -108,7 +108,7 @@ def _(matrices: Sequence[Tensor], tile: int) -> tuple[Tensor, Tensor]:
 
 @triton.jit
 def link_products_kernel(
-    lines, matrices, tiles, found, num_lines, num_rows, num_planes, num_tiles, steps,
+    lines, matrices, tiles, result, num_lines, num_rows, num_planes, num_tiles, steps,
     LINES: tl.constexpr, SIZE: tl.constexpr, REST: tl.constexpr, DEPTH: tl.constexpr, IS_HELD: tl.constexpr,
 ):  # fmt: skip
     """Multiply `steps` blocks of lines by one tile of a link's matrix."""
@@ -118,32 +118,32 @@ def link_products_kernel(
     first_line = tl.cast(tl.program_id(0) // num_tiles, tl.int64) * (LINES * steps)
     num_left = tl.minimum(num_lines - first_line, LINES * steps).to(tl.int32)
     lines += first_line * num_rows + row
-    found += (plane * num_lines + first_line) * num_rows + row
+    result += (plane * num_lines + first_line) * num_rows + row
 
     to, link_from, rest_from = first + tl.arange(0, SIZE), tl.arange(0, SIZE), SIZE + tl.arange(0, REST if REST else SIZE)
     is_to = (to < size)[None, :]
     is_from, is_rest = link_from < size, rest_from < size
     matrices += place + to[None, :]
-    # Padding is zero on both sides of a product: what is not a number in a link stays in it.
+    # Padding is zero on both sides of a product, so NaN in one link does not reach another.
     if IS_HELD:
         matrix = tl.load(matrices + (link_from * num_planes * size)[:, None], is_to & is_from[:, None], 0.0)
         if REST:
             rest = tl.load(matrices + (rest_from * num_planes * size)[:, None], is_to & is_rest[:, None], 0.0)
     for start in range(0, num_left, LINES):
         line = start + tl.arange(0, LINES)
-        # Beyond the last line the last is read again, so that reading needs no mask of lines.
-        own = (tl.minimum(line, num_left - 1) * num_rows)[:, None]
+        # Rows beyond the last line load the last line again: the load needs no mask of lines.
+        offset = (tl.minimum(line, num_left - 1) * num_rows)[:, None]
         if IS_HELD:
-            part = tl.load((lines + link_from)[None, :] + own, is_from[None, :], 0.0)
+            part = tl.load((lines + link_from)[None, :] + offset, is_from[None, :], 0.0)
             total = tl.dot(part, matrix, input_precision="tf32x3")
             if REST:
-                part = tl.load((lines + rest_from)[None, :] + own, is_rest[None, :], 0.0)
+                part = tl.load((lines + rest_from)[None, :] + offset, is_rest[None, :], 0.0)
                 total = tl.dot(part, rest, total, input_precision="tf32x3")
         else:
             total = tl.zeros((LINES, SIZE), tl.float32)
             for low in range(0, size, DEPTH):
                 those = low + tl.arange(0, DEPTH)
-                part = tl.load((lines + those)[None, :] + own, (those < size)[None, :], 0.0)
+                part = tl.load((lines + those)[None, :] + offset, (those < size)[None, :], 0.0)
                 block = tl.load(matrices + (those * num_planes * size)[:, None], is_to & (those < size)[:, None], 0.0)
                 total = tl.dot(part, block, total, input_precision="tf32x3")
-        tl.store((found + to)[None, :] + (line * num_rows)[:, None], total, is_to & (line < num_left)[:, None])
+        tl.store((result + to)[None, :] + (line * num_rows)[:, None], total, is_to & (line < num_left)[:, None])

@@ -1,4 +1,4 @@
-"""Few numbers on the host: those of a GPU without waiting for it, and operations by one thread."""
+"""Small tensors on the host: copies from a GPU without a wait, and operations on one thread."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from torch import Tensor
 
 
 class HostCopy:
-    """A tensor's numbers on the host; of one on a GPU, which is not waited for, those that an earlier call found there."""
+    """A tensor's values on the host. For a tensor on a GPU they are from an earlier call, so no call waits."""
 
     def __init__(self) -> None:
-        """Begin; nothing has been copied."""
+        """Start without a copy."""
         self._copy: Tensor | None = None
         self._copied: torch.cuda.Event | None = None
 
     def poll(self, values: Tensor) -> Tensor | None:
-        """Return the numbers that have arrived, None if none have, and have the present ones copied."""
+        """Return the last values that have arrived, None if none have, and start a copy of the present ones."""
         if values.device.type != "cuda":
             return values.detach()
         if torch.cuda.is_current_stream_capturing() or (self._copied is not None and not self._copied.query()):
@@ -35,14 +35,14 @@ class HostCopy:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Have torch do operations of few numbers by one thread; afterwards it has as many as before.
+    """Run torch's operations on one thread within the block, for small tensors.
 
-    torch itself shares out no operation of less than 2¹⁵ numbers, but roots, exponentials and logarithms are MKL's, which wakes
-    all threads for 256: to wake one that sleeps takes a tenth of a millisecond and more, and one that does not sleep is in the
-    way of MuJoCo's.
+    torch itself splits no operation of less than 2¹⁵ elements, but roots, exponentials and logarithms are MKL's, which uses all
+    threads from 256 elements on. Waking a sleeping thread takes a tenth of a millisecond or more, and a spinning one slows
+    MuJoCo's threads.
 
-    The number is the calling thread's, and that which Python threads begin with: one whose first work in torch falls into this
-    block keeps one thread, until it calls `torch.set_num_threads`.
+    The setting applies to the calling thread, and is the initial value for Python threads: a thread whose first work in torch
+    falls into this block keeps one thread, until it calls `torch.set_num_threads`.
     """
     num_threads = torch.get_num_threads()
     torch.set_num_threads(1)

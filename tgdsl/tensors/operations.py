@@ -1,7 +1,7 @@
-"""Operations that have a Triton kernel beside their definition in torch, and how one of the two is chosen.
+"""Operations with a definition in torch and a Triton kernel, and the choice between the two.
 
-An operation stands in the file of its definition. The kernel's file knows nothing of that file: what both need stands below
-them. `tgdsl.sensors.operations` lists all operations.
+An operation stands in the file of its definition. The kernel's file does not import that file; both import shared code from
+lower modules. `tgdsl.sensors.operations` lists all operations.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Operation(Generic[P, R]):
     # an instant, and torch.compile traces an import statement, but no `importlib.import_module`.
     kernel: Callable[P, R]
     inputs: Callable[P, Iterable[Tensor]]  # the tensors that have to be float32, on a GPU and without derivatives
-    condition: Callable[P, bool] | None = None  # what the arguments have to meet besides; None: nothing
+    condition: Callable[P, bool] | None = None  # further condition on the arguments; None: none
 
     def takes_kernel(self, *args: P.args, **kwargs: P.kwargs) -> bool:
         """Return whether a call with these arguments launches the kernel."""

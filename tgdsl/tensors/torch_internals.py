@@ -36,12 +36,12 @@ class HookedModule(nn.Module):
     def on_load(self, state_dict: dict[str, Any], prefix: str, errors: list[str], load: Callable[[], object]) -> None:
         """Load the module's own buffers from below `prefix`; a subclass may make room for them first, or leave them.
 
-        `errors` has what is wrong with the state dict so far; `load_state_dict` raises all of it at its end.
+        `errors` collects the errors of the state dict; `load_state_dict` raises all of them at its end.
         """
         load()
 
     def on_load_metadata(self, metadata: Mapping[str, Any]) -> None:
-        """Look at what `state_dict` noted of this module beside its tensors, before these are loaded; here, do nothing."""
+        """Check the metadata that `state_dict` stored for this module, before its tensors are loaded; here, do nothing."""
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> HookedModule:
         self.on_move(fn, lambda: super(HookedModule, self)._apply(fn, recurse))
@@ -62,7 +62,7 @@ def buffers_of(module: nn.Module) -> dict[str, Tensor | None]:
 
 
 def held_buffers(module: nn.Module) -> dict[str, Tensor]:
-    """Return a module's own buffers in a dictionary of their own, less those that are None: `named_buffers` takes longer."""
+    """Return a new dictionary of a module's own buffers that are not None: `named_buffers` takes longer."""
     return {name: buffer for name, buffer in buffers_of(module).items() if buffer is not None}
 
 
@@ -94,10 +94,10 @@ def below_autograd() -> AbstractContextManager[object]:
 
 
 def is_followed() -> bool:
-    """Return whether someone follows each operation, who would miss what is done without torch, or by a look at values.
+    """Return whether torch intercepts each operation, so that work outside torch, or branches on values, would be lost.
 
-    That is derivatives forwards (`torch.autograd.forward_ad`, `torch.func.jvp`), which go on without gradients; `vmap`;
-    tracing; and dispatch modes, which count or record. Asked in 0.2 µs. Reason: none of it is public.
+    Interceptors are forward-mode derivatives (`torch.autograd.forward_ad`, `torch.func.jvp`), also without gradients; `vmap`;
+    tracing; and dispatch modes, which count or record. The check takes 0.2 µs. Reason: none of it is public.
     """
     return (
         maybe_current_level() is not None
@@ -167,8 +167,8 @@ def fix_sizes(tensor: Tensor, sizes: Sequence[int]) -> None:
 
     `torch._check` is documented, but has no public name.
     """
-    for size, wanted in zip(tensor.shape[tensor.ndim - len(sizes) :], sizes, strict=True):
-        torch._check(size == wanted)
+    for size, expected in zip(tensor.shape[tensor.ndim - len(sizes) :], sizes, strict=True):
+        torch._check(size == expected)
 
 
 def expect_size(size: torch.SymInt, value: int) -> torch.SymInt:
