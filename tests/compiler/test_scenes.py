@@ -116,7 +116,7 @@ def test_one_geom_instead_of_the_scenes(tmp_path):
     [
         ({}, "expected `body`, the name of a body in the scene, or `geom` or `variants` for a body of its own"),
         ({"geom": BALL, "variants": [BALL]}, "found `geom` and `variants`, expected one of them"),
-        ({"body": "pad", "pos": [0, 0, 1]}, '`pos` is for a body of its own; of body "pad" the scene says it'),
+        ({"body": "pad", "pos": [0, 0, 1]}, '`pos` is for an added body; the scene sets it for body "pad"'),
         ({"geom": {"type": "plane", "size": [1]}}, "objects.item.geom.type: found \"plane\", expected 'sphere'"),
         ({"geom": {"mesh": "no.stl"}}, 'objects.item.geom: there is no file "no.stl"'),
         ({"geom": BALL, "joint": "hinge"}, "objects.item.joint: found \"hinge\", expected 'free' or 'fixed'"),

@@ -301,7 +301,7 @@ def test_what_a_state_may_hold(tmp_path):
         ({"variants": [{"type": "sphere", "size": [0.01], "quat": [0, 0, 0, 0]}]}, "is no orientation"),
         (
             {"variants": ODD, "surface": "skin"},
-            'surface "skin" names a geom; with geoms of its own it is `collision` or `visual`',
+            'surface "skin" names a geom; with `geom` or `variants`: `collision` or `visual`',
         ),
         ({"variants": ODD, "size": "per_env"}, "has one geom, a primitive; found sphere, box; primitives: sphere"),
         ({"variants": ODD, "body": "pad"}, 'body "pad" carries taxels, so its geoms cannot be others'),

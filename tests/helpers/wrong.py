@@ -86,11 +86,11 @@ WRONG = {
     ),
     "an object that is nowhere": (
         instead("{body: ball}", "{}"),
-        "hand.yaml:4:9: objects.ball: expected `body`, the name of a body in the scene, or `geom` or `variants` for a body of its own",
+        "hand.yaml:4:9: objects.ball: expected `body`, the name of a body in the scene, or `geom` or `variants` for an added body",
     ),
     "heat of nothing": (
         instead("{body: ball}", "{body: ball, temperature: 45}"),
-        "hand.yaml:4:9: objects.ball: `temperature` is for the flow of heat, which needs `material`, such as `steel`",
+        "hand.yaml:4:9: objects.ball: `temperature` is for heat flow, which needs `material`, such as `steel`",
     ),
     "heat of an unknown volume": (
         instead("{body: ball}", "{body: ball, material: steel, size: per_env}"),

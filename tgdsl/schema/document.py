@@ -30,11 +30,10 @@ class RobotSpec(SpecModel):
     """MJCF, URDF or USD file, relative to this document; or the name of a robot that comes with tgdsl, such as `xhand1`."""
     layout: Annotated[Text | Annotated[LayoutSpec, Tag("other")], TEXT_OR_OTHER] | None = None
     """Layout file, relative to this document, or the same mapping in line; default: the layout of a robot given by name.
-    Not needed where no sensor reads taxels, such as `link_contact`: these are then on any of the robot's bodies."""
+    Not needed if no sensor reads taxels, as `link_contact` does not: sensors may then be on any of the robot's bodies."""
     collision: Literal["mesh", "primitive"] = "mesh"
     """What links collide with, in the scene too: `mesh`: the model's own geoms, meshes by their convex hulls; `primitive`: the
-    capsules, spheres and boxes of `colliders.yaml` beside the model in their place, which are faster. Taxels stay where they
-    are."""
+    capsules, spheres and boxes of `colliders.yaml` next to the model instead, which are faster. Taxels stay in place."""
 
 
 class SceneSpec(SpecModel):
@@ -45,7 +44,7 @@ class SceneSpec(SpecModel):
 
 
 class Spec(SpecModel):
-    """What is felt: robot, scene, objects, sensors, noise and observations."""
+    """A tactile document: robot, scene, objects, sensors, noise and observations."""
 
     tgdsl: Literal[1]
     """Version of the grammar."""
@@ -54,13 +53,13 @@ class Spec(SpecModel):
     scene: SceneSpec | None = None
     """Robot and objects in one MuJoCo scene; default: the robot's own file."""
     objects: dict[Name, ObjectSpec] = {}
-    """What taxels can feel; nothing else is modelled."""
+    """Objects that taxels can sense; nothing else is modelled."""
     resolution: str | None = None
     """One of the layout's resolutions; may be left out where it has only one."""
     sensors: Annotated[dict[Name, ProbeSpec], Field(min_length=1)]
     """Sensors by name."""
     noise: dict[Name, NoiseSpec] = {}
-    """Named noise profiles, beside the built-in `clean` and `noisy`."""
+    """Named noise profiles, in addition to the built-in `clean` and `noisy`."""
     observations: dict[Name, Annotated[tuple[ObservationSpec, ...], Field(min_length=1)]] = {}
     """What policies read: groups of observation terms, concatenated in order."""
 
@@ -80,7 +79,7 @@ def _document_model(
         field: Any = Annotated[Text | Annotated[noise, Tag("other")], TEXT_OR_OTHER]
         about = AnySensorSpec.model_fields["noise"]
         described = Field(default=about.default, description=about.description)
-        specs = tuple(create_model(own.__name__, __base__=own, __doc__=own.__doc__, noise=(field, described)) for own in specs)
+        specs = tuple(create_model(s.__name__, __base__=s, __doc__=s.__doc__, noise=(field, described)) for s in specs)
     union: Any = Annotated[Union[specs], Field(discriminator="kind")] if len(specs) > 1 else specs[0]  # type: ignore  # noqa: UP007
     need: dict[str, Any] = {"min_length": 1} if needs_sensors else {"default": {}}
     sensors = (dict[Name, union], Field(description="Sensors by name.", **need))
@@ -113,11 +112,11 @@ def json_schema(kinds: tuple[Kind, ...] | None = None) -> dict[str, Any]:
 
 
 def conditional(schema: Any, definitions: Mapping[str, Schema]) -> Any:
-    """Return a schema that accepts the same values with `if`, `then` and `else` in the place of `anyOf`.
+    """Return a schema that accepts the same values, with `if`, `then` and `else` instead of `anyOf`.
 
-    Of `anyOf` an editor shows only that no branch fits, at the whole value: a misspelt key then underlines the sensor. Of `if`
-    and `then` it shows what is wrong in the one branch that is meant. Alternatives are told apart by JSON type, by a key, or by
-    its value. `definitions` are what references lead to.
+    For `anyOf` an editor only reports that no branch fits, at the whole value: a misspelt key underlines the sensor. For `if`
+    and `then` it reports the mistake in the branch that applies. Branches are distinguished by JSON type, by a key, or by its
+    value. `definitions` resolve references.
     """
     if isinstance(schema, list):
         return [conditional(part, definitions) for part in schema]
@@ -143,14 +142,14 @@ def conditional(schema: Any, definitions: Mapping[str, Schema]) -> Any:
 
 
 def _branches(schema: Schema) -> list[Schema]:
-    own = schema.get("anyOf") or schema.get("oneOf") or []
-    inner = [(_branches(part) if not part.keys() - {"anyOf", "oneOf", "discriminator"} else []) or [part] for part in own]
+    choices = schema.get("anyOf") or schema.get("oneOf") or []
+    inner = [(_branches(part) if not part.keys() - {"anyOf", "oneOf", "discriminator"} else []) or [part] for part in choices]
     return [part for parts in inner for part in parts]
 
 
 def _discriminator(schema: Schema) -> Mapping[str, Any]:
-    own = schema.get("anyOf") or schema.get("oneOf") or []
-    inner = (_discriminator(part) for part in own if isinstance(part, dict))
+    choices = schema.get("anyOf") or schema.get("oneOf") or []
+    inner = (_discriminator(part) for part in choices if isinstance(part, dict))
     return schema.get("discriminator") or next((result for result in inner if result), {})
 
 
@@ -159,7 +158,7 @@ def _target(schema: Schema, definitions: Mapping[str, Schema]) -> Schema:
 
 
 def _of_objects(branches: Sequence[Schema], definitions: Mapping[str, Schema], discriminator: Mapping[str, Any]) -> Schema:
-    """Return one schema of several of mappings, told apart by the value of a key, or by a key that only one of them needs."""
+    """Return one schema for several mappings, distinguished by a key's value, or by a key that only one of them requires."""
     if len(branches) < 2:
         return conditional(branches[0], definitions) if branches else {}
     chain: Schema = {}

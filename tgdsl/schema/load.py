@@ -1,4 +1,4 @@
-"""From a document's text to its Spec: every mistake is found in one run and reported at its place."""
+"""From a document's text to its Spec: all mistakes are reported in one run, each at its place."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tgdsl.sensors.noise.pipeline import knobs_of
 S = TypeVar("S", bound=BaseModel)
 GIVEN = "<scene>"  # the robot's model of a document that names none, where a scene is given
 ROBOT = "a robot or scene file, which a document names: `robot: {model: …}`"
-# what files are that are no YAML documents, by their endings
+# descriptions of files that are not YAML documents, by ending
 NO_DOCUMENTS = {
     ".safetensors": "an artefact, which `tgdsl.load` reads",
     ".pt": "a policy or checkpoint",
@@ -44,17 +44,17 @@ class Section:
     source: Source  # its text's values and places
     folder: FilePath  # folder that file names in it are relative to
     problems: list[Problem]  # mistakes found so far, of the document and its layout; later stages add theirs
-    prefix: Path = ()  # where its paths start in the source: of a layout in line, where that stands in its document
+    prefix: Path = ()  # path of the section in the source, such as of an inline layout in its document
 
     def problem(self, path: Path, what: str, hint: str = "", on_key: bool = False) -> Problem:
         """Return a mistake at a path."""
         return self.source.problem((*self.prefix, *path), what, hint, on_key)
 
-    def note(self, path: Path, what: str | LowerError, hint: str = "", on_key: bool = False) -> None:
-        """Note a mistake at a path; a `LowerError` at the field of it that the error names."""
-        if isinstance(what, LowerError):
-            path, what, hint = (*path, *([what.field] if what.field else [])), what.what, what.hint
-        self.problems.append(self.problem(path, what, hint, on_key))
+    def note(self, path: Path, problem: str | LowerError, hint: str = "", on_key: bool = False) -> None:
+        """Note a mistake at a path; a `LowerError` at the field that it names."""
+        if isinstance(problem, LowerError):
+            path, problem, hint = (*path, *([problem.field] if problem.field else [])), problem.what, problem.hint
+        self.problems.append(self.problem(path, problem, hint, on_key))
 
     def raw(self, path: Path) -> Any:
         """Return the plain value at a path, or None."""
@@ -112,11 +112,11 @@ def load(
     """Read a document and its layout, with the problems found so far: call `raise_problems` when all stages have added theirs.
 
     File names in a mapping are relative to the working folder. `overrides` are set first, by dotted path, as YAML text or
-    plain. `sensors` names those that are wanted, the others being left out but for those that they read. `has_scene`: a scene
-    is given, so that the document needs no model.
+    plain. `sensors` names the sensors to keep, with the sensors that they read; default: all. `has_scene`: a scene is given,
+    and the document needs no model.
 
     Raises:
-        SpecError: If so much is wrong that no further stage can look at it.
+        SpecError: If the document is too faulty for further stages.
         TgdslError: If the document is neither a file's name nor a mapping.
     """
     if not isinstance(document, (str, PathLike, Mapping)):
@@ -148,26 +148,26 @@ def load(
     return loaded
 
 
-def _with_upstream(written: Any, wanted: Collection[str], kinds: Sequence[Kind]) -> Collection[str]:
-    """Return the names of sensors that are wanted and of all that they read, as the document has it, right or wrong."""
-    by_name, result, waiting = {kind.name: kind for kind in kinds}, dict.fromkeys(wanted), list(wanted)
-    own = written if isinstance(written, dict) else {}
-    kind_of = {name: by_name.get(str(s.get("kind"))) if isinstance(s, dict) else None for name, s in own.items()}
+def _with_upstream(written: Any, names: Collection[str], kinds: Sequence[Kind]) -> Collection[str]:
+    """Return the names of some sensors and of all sensors that they read, according to the document, valid or not."""
+    by_name, result, waiting = {kind.name: kind for kind in kinds}, dict.fromkeys(names), list(names)
+    sensors = written if isinstance(written, dict) else {}
+    kind_of = {name: by_name.get(str(s.get("kind"))) if isinstance(s, dict) else None for name, s in sensors.items()}
     while waiting:
         name = waiting.pop()
         kind = kind_of.get(name)
         if kind is None or not kind.reads:
             continue
-        named = own[name].get(kind.reads)
+        named = sensors[name].get(kind.reads)
         every = [other for other, k in kind_of.items() if k is not None and k.provides]
-        read = [other for other in (named if isinstance(named, list) else every) if other in own and other not in result]
+        read = [other for other in (named if isinstance(named, list) else every) if other in sensors and other not in result]
         result |= dict.fromkeys(read)
         waiting += read
     return list(result)
 
 
 def read_source(path: FilePath, name: str = "") -> Source:
-    """Read a file's values and where they stand, as YAML; `name` stands for it in messages, by default its path."""
+    """Read a YAML file's values and their places; `name` is its name in messages, by default its path."""
     return _source(_content(path, name or str(path)), name or str(path))
 
 
@@ -195,14 +195,14 @@ def _source(content: bytes, name: str) -> Source:
 
 
 def read_spec(document: FilePath | Mapping[str, Any], model: type[S], required: tuple[str, ...]) -> tuple[S, Source]:
-    """Read a file, or a mapping, that holds one model with the `required` keys, and where its values stand."""
+    """Read one model with the `required` keys from a file or a mapping; return it with the places of its values."""
     if isinstance(document, Mapping):
         return parse_spec(document, "<mapping>", model, required)
     return parse_spec(_content(document, str(document)), str(document), model, required)
 
 
 def parse_spec(content: bytes | Mapping[str, Any], name: str, model: type[S], required: tuple[str, ...]) -> tuple[S, Source]:
-    """Read what `read_spec` reads from a file's content, or from a mapping; mistakes then go by a name."""
+    """Read a model as `read_spec` does, from a file's content or a mapping; mistakes are reported under `name`."""
     source = from_mapping(content, name) if isinstance(content, Mapping) else _source(content, name)
     problems = list(source.problems)
     spec = validate(source, (), model, problems, required=required)
@@ -222,22 +222,24 @@ def load_layout(path: FilePath) -> LoadedLayout:
 
 
 def load_colliders(file: FilePath) -> tuple[Collider, ...]:
-    """Return the primitive colliders of a robot's links, those of one body after another, from a file beside its model."""
+    """Return the primitive colliders of a robot's links, body by body, from the file next to its model."""
     spec, _ = read_spec(file, CollidersSpec, ("tgdsl", "bodies"))
     return tuple(
-        Collider(body, own.type, own.size, own.pos, own.quat, own.core) for body, parts in spec.bodies.items() for own in parts
+        Collider(body, part.type, part.size, part.pos, part.quat, part.core)
+        for body, parts in spec.bodies.items()
+        for part in parts
     )
 
 
 def _layout(loaded: Loaded) -> LoadedLayout | None:
-    wanted = loaded.spec.robot.layout
+    written = loaded.spec.robot.layout
     source, prefix, folder = loaded.source, ("robot", "layout"), loaded.folder
-    if wanted is None or isinstance(wanted, str):
-        path = _layout_file(loaded, wanted)
+    if written is None or isinstance(written, str):
+        path = _layout_file(loaded, written)
         if path is None:
             return None
-        # In messages it has the name that a user would type from where the document's name counts.
-        name = str(path) if wanted is None else str(FilePath(loaded.source.file).parent / wanted)
+        # Its name in messages is relative to the same folder as the document's.
+        name = str(path) if written is None else str(FilePath(loaded.source.file).parent / written)
         try:
             source, prefix, folder = read_source(path, name), (), path.parent
         except SpecError as error:
@@ -257,8 +259,8 @@ def _layout_file(loaded: Loaded, wanted: str | None) -> FilePath | None:
             return path
         loaded.note(("robot", "layout"), f'there is no file "{wanted}"', "paths are relative to this document")
         return None
-    known = find.robot_names().get(loaded.spec.robot.model)
-    if known is not None and (path := find.layout_file(known)) is not None:
+    model_file = find.robot_names().get(loaded.spec.robot.model)
+    if model_file is not None and (path := find.layout_file(model_file)) is not None:
         return path
     if not loaded.is_without_layout:
         loaded.note(("robot",), 'missing key "layout"', "only robots given by name bring their own layout", on_key=True)
@@ -266,7 +268,7 @@ def _layout_file(loaded: Loaded, wanted: str | None) -> FilePath | None:
 
 
 def _check_references(loaded: Loaded, kinds: tuple[Kind, ...]) -> None:
-    """Note references within the document that lead nowhere, and knobs that a kind does not have."""
+    """Note broken references within the document, and knobs that a kind does not have."""
     by_name, objects = {kind.name: kind for kind in kinds}, _names(loaded, "objects")
     for name, sensor in loaded.spec.sensors.items():
         for i, target in enumerate(sensor.objects):
@@ -281,13 +283,13 @@ def _check_references(loaded: Loaded, kinds: tuple[Kind, ...]) -> None:
 
 
 def _names(loaded: Loaded, key: str) -> list[str] | None:
-    """Return the names that the document gives, also those of faulty entries; None if that cannot be told."""
+    """Return the entries' names, faulty entries included; None if the section is not a mapping."""
     result = loaded.source.value.get(key, {})
     return list(result) if isinstance(result, dict) else None
 
 
 def _check_observations(loaded: Loaded) -> None:
-    """Note sensors that have the name of a reading that none makes, and observations of sensors that are not there."""
+    """Note sensors with the name of a proprioceptive reading, and observations of unknown sensors."""
     sensors = _names(loaded, "sensors") or []
     for name in PROPRIOCEPTION.keys() & set(sensors):
         problem = f'"{name}" is the name of a reading that no sensor makes'
@@ -304,7 +306,7 @@ def _check_observations(loaded: Loaded) -> None:
 
 
 def _check_resolution(loaded: Loaded) -> None:
-    """Note that the resolution is not one of the layout's, or that one must be named."""
+    """Note an unknown resolution, or a missing one."""
     named, path = loaded.resolution, ("resolution",)
     if loaded.is_without_layout and named is not None:
         problem = f'there is no layout, which could have a resolution "{named}"'
@@ -318,25 +320,25 @@ def _check_resolution(loaded: Loaded) -> None:
 
 
 def _check_noise(loaded: Loaded, name: str, noise: str | NoiseSpec, kind: Kind | None) -> None:
-    """Note what is wrong with a sensor's noise: profiles that do not exist, and knobs that its kind does not have."""
+    """Note mistakes of a sensor's noise: unknown profiles, and knobs that its kind does not have."""
     path: Path = ("sensors", name, "noise")
     chain = _profiles(loaded, path, noise)
     if chain is None or kind is None:
         return
-    own = noise if isinstance(noise, NoiseSpec) else None
+    inline = noise if isinstance(noise, NoiseSpec) else None
     base, links = resolve_noise(noise, kind.name, loaded.spec.noise)
-    known = knobs_of(kind.knobs)
+    kind_knobs = knobs_of(kind.knobs)
     for pattern, knobs in [("", base), *links]:
-        for knob in (knob for knob in knobs.active() if knob not in known):
-            what, hint = f'"{kind.name}" has no knob "{knob}"', f"it has {', '.join(sorted(known)) or 'none'}"
-            if own is not None and (pattern in own.links if pattern else knob in own.model_fields_set):
-                loaded.note((*path, "links", pattern, knob) if pattern else (*path, knob), what, hint)
+        for knob in (knob for knob in knobs.active() if knob not in kind_knobs):
+            problem, hint = f'"{kind.name}" has no knob "{knob}"', f"it has {', '.join(sorted(kind_knobs)) or 'none'}"
+            if inline is not None and (pattern in inline.links if pattern else knob in inline.model_fields_set):
+                loaded.note((*path, "links", pattern, knob) if pattern else (*path, knob), problem, hint)
             else:
-                loaded.note(path, f"{what} (in the profile {' → '.join(chain)})", hint)
+                loaded.note(path, f"{problem} (in the profile {' → '.join(chain)})", hint)
 
 
 def _profiles(loaded: Loaded, path: Path, noise: str | NoiseSpec) -> list[str] | None:
-    """Return the profiles that a sensor's noise leads to, one after the other; None if there is a mistake, which is noted."""
+    """Return the chain of profiles of a sensor's noise; None after a mistake, which is noted."""
     written, chain = _names(loaded, "noise"), []
     place, name = (path, noise) if isinstance(noise, str) else ((*path, "like"), noise.like)
     while True:
@@ -355,25 +357,25 @@ def _profiles(loaded: Loaded, path: Path, noise: str | NoiseSpec) -> list[str] |
 
 
 def warn_of_unusual(source: Source, spec: BaseModel) -> None:
-    """Warn of each unusual value of a document that was read as `spec`, at its place."""
-    found = {}
+    """Warn of each unusual value of a document, read as `spec`, at its place."""
+    messages = {}
     for path, usual, value in _marked(spec, (), None):
         if (problem := usual.doubt(value)) is not None:
             path = _place(source, path)
-            found[path, problem] = str(source.problem(path, *problem))
-    for message in found.values():
+            messages[path, problem] = str(source.problem(path, *problem))
+    for message in messages.values():
         warnings.warn(message, stacklevel=4)
 
 
 def _place(source: Source, path: Path) -> Path:
-    """Return where a value stands in the file: a number may stand for a range, and a region for a list of one."""
+    """Return a value's path in the file, where a number may abbreviate a range, and a region a list of one."""
     shorter = [path[:i] + path[i + 1 :] for i, part in enumerate(path) if isinstance(part, int)]
     nearer = [path[:i] for i in range(len(path) - 1, 0, -1)]
     return next((place for place in (path, *reversed(shorter), *nearer) if source.get(place) is not None), ())
 
 
 def _marked(value: object, path: Path, mark: Usual | None) -> Iterator[tuple[Path, Usual, float]]:
-    """Yield the numbers of all fields that are marked, their places and marks."""
+    """Yield the places, marks and values of all marked numbers."""
     if isinstance(value, (int, float)) and mark is not None:
         yield path, mark, float(value)
     elif isinstance(value, BaseModel):

@@ -1,4 +1,4 @@
-"""What taxels can feel: bodies of the scene, and geoms that differ between environments."""
+"""Objects that taxels can sense: bodies of the scene, and geoms that differ between environments."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ class ObjectSpec(SpecModel):
     pos: Annotated[Position | None, Usual("length", high=10.0)] = None
     """Initial position of an added body in the world [m]; default: the origin."""
     quat: Quat | None = None
-    """Initial orientation of an added body, w, x, y, z; default: that of the world."""
+    """Initial orientation of an added body, w, x, y, z; default: the world's axes."""
     joint: Literal["free", "fixed"] | None = None
     """Joint of an added body: it moves freely (default), or is fixed to the world."""
     contype: Bits | None = None
@@ -185,9 +185,9 @@ class ObjectSpec(SpecModel):
 
     @model_validator(mode="after")
     def _check_heat(self) -> ObjectSpec:
-        given = [key for key in ("temperature", "cells") if getattr(self, key) is not None]
-        if given and self.material is None:
-            raise ValueError(f"`{given[0]}` is for the flow of heat, which needs `material`, such as `steel`")
+        thermal = [key for key in ("temperature", "cells") if getattr(self, key) is not None]
+        if thermal and self.material is None:
+            raise ValueError(f"`{thermal[0]}` is for heat flow, which needs `material`, such as `steel`")
         if self.material is not None and self.size == "per_env":
             raise ValueError("`material` with `size: per_env` is not supported: heat needs a volume known beforehand")
         return self
@@ -197,27 +197,27 @@ class ObjectSpec(SpecModel):
         if self.geom is not None and self.variants is not None:
             raise ValueError("found `geom` and `variants`, expected one of them")
         if self.body is None and not self.compounds:
-            raise ValueError("expected `body`, the name of a body in the scene, or `geom` or `variants` for a body of its own")
-        own = [key for key in ("pos", "quat", "joint", "contype", "conaffinity") if getattr(self, key) is not None]
-        if self.body is not None and own:
-            raise ValueError(f'`{own[0]}` is for a body of its own; of body "{self.body}" the scene says it')
+            raise ValueError("expected `body`, the name of a body in the scene, or `geom` or `variants` for an added body")
+        added = [key for key in ("pos", "quat", "joint", "contype", "conaffinity") if getattr(self, key) is not None]
+        if self.body is not None and added:
+            raise ValueError(f'`{added[0]}` is for an added body; the scene sets it for body "{self.body}"')
         if self.compounds and self.surface not in ("collision", "visual"):
-            raise ValueError(f'surface "{self.surface}" names a geom; with geoms of its own it is `collision` or `visual`')
+            raise ValueError(f'surface "{self.surface}" names a geom; with `geom` or `variants`: `collision` or `visual`')
         return self
 
     @property
     def compounds(self) -> tuple[tuple[PrimitiveGeom | MeshGeom, ...], ...]:
-        """The geoms of each variant; none if it is the scene's own."""
+        """The geoms of each variant; none if the object has the scene's geoms."""
         variants = self.variants or (() if self.geom is None else (self.geom,))
         return tuple(part.geoms if isinstance(part, CompoundGeoms) else (part,) for part in variants)
 
     def body_of(self, name: str) -> str:
-        """Return its body, its own name being this."""
+        """Return the name of its body; `name` is the object's."""
         return name if self.body is None else self.body
 
 
 def query_alternatives() -> list[Alternative]:
-    """Return how distances to meshes may be found, from coarse to fine; to primitives they are exact."""
+    """Return the distance queries for meshes, from coarse to fine; distances to primitives are exact."""
     grids = [
         Alternative(f"grid, {1e3 * error:g} mm", {"query": "sdf", "tolerance": error}) for error in (1e-3, 2e-4, 5e-5, 1e-5)
     ]

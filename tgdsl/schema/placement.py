@@ -1,4 +1,4 @@
-"""Where taxels sit: link groups and, per resolution and link, how its surface is sampled."""
+"""The layout of taxels: link groups and, per resolution and link, how its surface is sampled."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class _Sampled(SpecModel):
     region: Region = ()
     """Part of the surface to sample: a region, or a list of regions that means their intersection; default: all of it."""
     surface: Literal["mesh", "collision"] = "mesh"
-    """`mesh`: meshes as they are; `collision`: as the simulator collides them, by their convex hulls, which on a concave mesh
-    keep objects away from what is inside."""
+    """`mesh`: meshes as they are; `collision`: their convex hulls, which the simulator collides, and which keep objects out of
+    the hollows of a concave mesh."""
     exposed: StrictBool = False
-    """Whether to leave out what is inside other colliding geoms of the robot in the model's initial state, such as the part of
+    """Whether to leave out surface inside other colliding geoms of the robot in the model's initial state, such as the part of
     a link that the next one covers."""
 
 
@@ -50,12 +50,12 @@ class Grid(_Sampled):
     direction: Direction
     """Direction of projection in the link frame, into the surface: `[-1, 0, 0]` samples the side that faces +x."""
     columns_along: Direction | None = None
-    """Axis along which the columns follow one another, link frame; default: the first of the link's z, y, x axes that is
-    not near parallel (|cos| < 0.7) to `direction`."""
+    """Axis of the columns in the link frame; default: the first of the link's z, y, x axes that is not near parallel
+    (|cos| < 0.7) to `direction`."""
     rows_reversed: bool = False
     """Whether row 0 is at the far end of the rows' axis: on a mirrored hand taxel i is then the mirror image of taxel i."""
     count: Count | None = None
-    """Keep this many of the cells that hit the surface, those nearest the centre of the grid; default: all that hit."""
+    """Number of cells to use, of the cells that hit the surface the nearest to the grid's centre; default: all that hit."""
 
     @model_validator(mode="after")
     def _enough_cells(self) -> Grid:
@@ -94,7 +94,7 @@ class Point(SpecModel):
     pos: Annotated[Position, Usual("length", high=5.0)]
     """Position in the link frame [m]."""
     normal: Direction
-    """Outward normal in the link frame; is made unit."""
+    """Outward normal in the link frame; it is normalised."""
     radius: Annotated[Radius | None, Usual("length", low=1e-5, high=0.1)] = None
     """Sensing radius [m]; default: the `radius` of the list."""
     area: Annotated[Area | None, Usual("area", high=0.01)] = None
@@ -122,7 +122,7 @@ class Points(SpecModel):
     method: Literal["points"]
     """Explicit probes."""
     points: Annotated[Text | Annotated[tuple[Point, ...], Field(min_length=1), Tag("other")], TEXT_OR_OTHER]
-    """The probes, or the name of a CSV file beside the layout (SI units), of which a link takes its own rows."""
+    """The probes, or the name of a CSV file next to the layout (SI units), from which each link takes its rows."""
     radius: Annotated[Radius | None, Usual("length", low=1e-5, high=0.1)] = None
     """Sensing radius of the points that name none [m]."""
 

@@ -9,7 +9,7 @@ from tgdsl.errors import did_you_mean
 from tgdsl.fields.models import Selection
 
 Report = Callable[[tuple[str, int], str, str], None]
-"""Called with where a pattern stands in its selection, such as `("exclude", 1)`, what is wrong with it, and a hint."""
+"""Called with a pattern's place in its selection, such as `("exclude", 1)`, the mistake, and a hint."""
 
 
 def matching(pattern: str, names: Sequence[str]) -> list[str]:
@@ -30,31 +30,31 @@ def select(
     group: str | None = None,
     elsewhere: Sequence[str] = (),
 ) -> list[int]:
-    """Return the candidates that a selection takes, as ascending indices; each candidate answers to several names.
+    """Return the ascending indices of the selected candidates; each candidate has several names.
 
-    `groups` may stand in place of names, also within one another; in its own definition a group's name means the link that is
-    called so. `report` is called for each pattern of the selection that matches nothing. Wildcards and groups in `exclude` may,
-    so that one selection serves several robots; a plain name may not, unless something `elsewhere` has it. Of a selection that
-    is itself a `group` it is reported too that it contains itself.
+    Groups may be used like names, also inside other groups; in its own definition a group's name means the link of that name.
+    `report` is called for each pattern that matches nothing, except wildcards and groups in `exclude`: one selection serves
+    several robots. A plain name in `exclude` must match a candidate or a name in `elsewhere`. For the selection of a `group`,
+    `report` is also called if the group contains itself.
     """
-    known = [*groups, *(name for names in candidates for name in names)]
+    valid = [*groups, *(name for names in candidates for name in names)]
     for i, pattern in enumerate(selection.include):
         if pattern in groups and not _group(pattern, candidates, groups, ()) and pattern != group:
-            if group is None or all(own in groups or _matched(own, candidates) for own in groups[pattern].include):
+            if group is None or all(name in groups or _matched(name, candidates) for name in groups[pattern].include):
                 report(("include", i), f'group "{pattern}" holds no link', "")
         elif pattern not in groups and not _matched(pattern, candidates):
-            report(("include", i), f'no link matches "{pattern}"', did_you_mean(pattern, known, "links"))
+            report(("include", i), f'no link matches "{pattern}"', did_you_mean(pattern, valid, "links"))
     for i, name in enumerate(selection.exclude):
-        if is_plain(name) and name not in known and name not in elsewhere:
-            hint = did_you_mean(name, [*known, *elsewhere], "links")
+        if is_plain(name) and name not in valid and name not in elsewhere:
+            hint = did_you_mean(name, [*valid, *elsewhere], "links")
             report(("exclude", i), f'no link matches "{name}"', hint)
     if group is not None and (cycle := _cycle(group, group, candidates, groups, ())):
         patterns = {name: (part, i) for part in ("exclude", "include") for i, name in enumerate(getattr(selection, part))}
         report(patterns[cycle[0]], f'group "{group}" contains itself', " → ".join([group, *cycle]))
-    return sorted(_chosen(selection, candidates, groups, () if group is None else (group,)))
+    return sorted(_selected(selection, candidates, groups, () if group is None else (group,)))
 
 
-def _chosen(
+def _selected(
     selection: Selection, candidates: Sequence[Sequence[str]], groups: Mapping[str, Selection], inside: tuple[str, ...]
 ) -> set[int]:
     def of(patterns: Sequence[str]) -> set[int]:
@@ -70,7 +70,7 @@ def _chosen(
 def _group(
     name: str, candidates: Sequence[Sequence[str]], groups: Mapping[str, Selection], inside: tuple[str, ...]
 ) -> set[int]:
-    return set() if name in inside else _chosen(groups[name], candidates, groups, (*inside, name))
+    return set() if name in inside else _selected(groups[name], candidates, groups, (*inside, name))
 
 
 def _matched(pattern: str, candidates: Sequence[Sequence[str]]) -> set[int]:

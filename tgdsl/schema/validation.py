@@ -1,4 +1,4 @@
-"""Plain values to models: pydantic's errors in the words of the document, and the rest of it still read."""
+"""Plain values to models: pydantic's errors in the document's terms; the document's valid rest is still read."""
 
 from __future__ import annotations
 
@@ -16,41 +16,41 @@ from tgdsl.schema.yaml import Path, Source
 
 M = TypeVar("M", bound=BaseModel)
 ENTRY_DEPTH = {"sensors": 2, "objects": 2, "noise": 2, "groups": 2, "observations": 3, "resolutions": 3}
-"""How deep an entry sits under each of these keys: a faulty entry is left out, and the rest is still checked."""
+"""Depth of an entry under each of these keys: a faulty entry is left out, and the rest is still checked."""
 
 DISCRIMINATORS = ("kind", "method", "type")
-"""Keys whose value says as what a mapping is read: pydantic's error locations hold that value as if it were a key."""
+"""Keys whose value selects a mapping's model: pydantic's error locations contain that value as if it were a key."""
 
 
 def validate(source: Source, prefix: Path, model: type[M], problems: list[Problem], required: tuple[str, ...]) -> M | None:
-    """Read a mapping as a model; note every mistake, leave faulty entries out, and read what is left."""
+    """Read a mapping as a model; note every mistake, and read it without the faulty entries."""
     value = source.get(prefix)
-    known: dict[int, type[BaseModel]] = {}
+    model_of: dict[int, type[BaseModel]] = {}
     try:
-        return model.model_validate(value, context=known)
-    except ValidationError as found:
-        errors = found.errors()
+        return model.model_validate(value, context=model_of)
+    except ValidationError as invalid:
+        errors = invalid.errors()
     entries: set[Path] = set()
     for error in errors:
-        path = _raw_path(value, error, known)
+        path = _raw_path(value, error, model_of)
         if not _is_follow_up(error):
-            problems.append(_problem(source, prefix, value, path, error, known))
+            problems.append(_problem(source, prefix, value, path, error, model_of))
         entries.add(path if error["type"] == "extra_forbidden" else _entry(path))
     return _rest(value, model, entries, required) if isinstance(value, dict) else None
 
 
 def _rest(value: dict, model: type[M], entries: set[Path], required: tuple[str, ...]) -> M | None:
-    """Read what is left without some entries, nor those that are faulty without them."""
+    """Read the mapping without some entries, and without entries that become faulty without them."""
     rest = copy.deepcopy(value)
     for entry in sorted(entries, key=lambda path: [f"{part:>9}" for part in path], reverse=True):
         _remove(rest, entry)
     if any(key not in rest for key in required):
         return None
-    known: dict[int, type[BaseModel]] = {}
+    model_of: dict[int, type[BaseModel]] = {}
     try:
-        return model.model_validate(rest, context=known)
-    except ValidationError as found:
-        more = {_entry(_raw_path(rest, error, known)) for error in found.errors()}
+        return model.model_validate(rest, context=model_of)
+    except ValidationError as invalid:
+        more = {_entry(_raw_path(rest, error, model_of)) for error in invalid.errors()}
         return _rest(rest, model, more, required) if more and () not in more and rest != value else None
 
 
@@ -60,7 +60,7 @@ def _is_follow_up(error: ErrorDetails) -> bool:
 
 
 def _raw_path(value: Any, error: ErrorDetails, known: Mapping[int, type[BaseModel]]) -> Path:
-    """Return the path through the plain value to where pydantic found an error: without the tags of unions, no keys."""
+    """Return the path of pydantic's error in the plain value: without the tags of unions, which are no keys."""
     path: list[str | int] = []
     location: tuple[Any, ...] = error["loc"]
     is_tagged = False
@@ -82,7 +82,7 @@ def _raw_path(value: Any, error: ErrorDetails, known: Mapping[int, type[BaseMode
 
 
 def _entry(path: Path) -> Path:
-    """Return the path of the entry that a path is in: what is left out so that the rest can be checked."""
+    """Return the path of the entry that contains a path: without the entry the rest can be checked."""
     for i, part in enumerate(path):
         if part in ENTRY_DEPTH:
             return path[: i + ENTRY_DEPTH[str(part)]]
@@ -104,8 +104,8 @@ def _remove(value: Any, path: Path) -> None:
 def _problem(
     source: Source, prefix: Path, value: Any, path: Path, error: ErrorDetails, known: Mapping[int, type[BaseModel]]
 ) -> Problem:
-    """Return one of pydantic's errors in the words of the document."""
-    kind, context, found = error["type"], error.get("ctx", {}), error["input"]
+    """Return one of pydantic's errors in the document's terms."""
+    kind, context, value_found = error["type"], error.get("ctx", {}), error["input"]
     full = (*prefix, *path)
     if kind == "extra_forbidden":
         parent = value
@@ -117,12 +117,12 @@ def _problem(
         problem = f'"{path[-1]}" is not a name, expected letters, digits, "_" and "-", first a letter or "_"'
         return source.problem(full, problem, on_key=True)
     if kind == "missing" and isinstance(path[-1], int):
-        return source.problem(full[:-1], f"found {_brief(found)}, value {path[-1] + 1} is missing")
+        return source.problem(full[:-1], f"found {_brief(value_found)}, value {path[-1] + 1} is missing")
     if kind == "missing":
         return source.problem(full[:-1], f'missing key "{path[-1]}"', on_key=True)
     if kind == "union_tag_not_found":
         key = context["discriminator"].strip("'")
-        near = get_close_matches(key, map(str, found) if isinstance(found, dict) else (), 1)
+        near = get_close_matches(key, map(str, value_found) if isinstance(value_found, dict) else (), 1)
         return source.problem(full, f'missing key "{key}"', f'is "{near[0]}" meant to be it?' if near else "", on_key=True)
     if kind == "union_tag_invalid":
         key = context["discriminator"].strip("'")
@@ -144,8 +144,8 @@ def _problem(
         "too_long": f"{context.get('max_length')} entries",
     }
     if kind in expected:
-        return source.problem(full, f"found {_brief(found)}, expected {expected[kind]}")
-    return source.problem(full, f"found {_brief(found)}: {error['msg'][0].lower()}{error['msg'][1:]}")
+        return source.problem(full, f"found {_brief(value_found)}, expected {expected[kind]}")
+    return source.problem(full, f"found {_brief(value_found)}: {error['msg'][0].lower()}{error['msg'][1:]}")
 
 
 def _brief(found: Any) -> str:

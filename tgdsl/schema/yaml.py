@@ -1,4 +1,4 @@
-"""YAML text to plain values, with the place of every value kept. YAML 1.2: `no` is a string, `1e-3` a number."""
+"""YAML text to plain values with the place of every value. YAML 1.2: `no` is a string, `1e-3` a number."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from tgdsl.errors import Problem, did_you_mean
 
 Path = tuple[str | int, ...]
-MAX_DEPTH = 50  # values that are nested more deeply are refused, before Python's own limit is reached in some odd place
-SET = "--set "  # names of overrides begin with it, where those of files stand in mistakes
+MAX_DEPTH = 50  # values that are nested more deeply are refused, before Python's recursion limit is reached
+SET = "--set "  # in mistakes, prefix of an override, in the place of a file's name
 _TOO_DEEP = f"nested more than {MAX_DEPTH} deep"
 
 
 class Unreadable:
-    """Stands, itself, for a value that could not be read: what is wrong with it is noted already."""
+    """Placeholder, used as a class, for a value that could not be read: its mistake is noted already."""
 
 
 class Mark(NamedTuple):
@@ -38,7 +38,7 @@ class Mark(NamedTuple):
 
 @dataclass
 class Source:
-    """A document as read: its plain value, where each part of it stands, and what is wrong with it as YAML."""
+    """A parsed document: its plain value, the place of each part, and its mistakes as YAML."""
 
     file: str
     value: Any = None  # mappings, lists and scalars
@@ -66,16 +66,16 @@ class Source:
         return value
 
     def keep(self, key: str, names: Collection[str]) -> None:
-        """Leave out all entries of a mapping but some; those that it does not have are a mistake."""
-        own = self.get((key,))
-        if not isinstance(own, dict):
+        """Keep only some entries of a mapping; names that it does not have are a mistake."""
+        entries = self.get((key,))
+        if not isinstance(entries, dict):
             return
-        missing = [name for name in names if name not in own]
-        self.problems += [self.problem((key,), f'there is no "{name}"', did_you_mean(name, own, key)) for name in missing]
-        self.value[key] = {name: value for name, value in own.items() if name in names}
+        missing = [name for name in names if name not in entries]
+        self.problems += [self.problem((key,), f'there is no "{name}"', did_you_mean(name, entries, key)) for name in missing]
+        self.value[key] = {name: value for name, value in entries.items() if name in names}
 
     def set(self, dotted: str, value: Any) -> None:
-        """Override one value, as the command line's `--set key.key=value` does; a text is YAML, all else a plain value."""
+        """Override one value, as the command line's `--set key.key=value` does; a string is read as YAML."""
         path: Path = tuple(str(dotted).split("."))
         name = f"{SET}{dotted}={value}"
         parsed = parse(value, name) if isinstance(value, str) else from_mapping({path[-1]: value}, name)
@@ -92,7 +92,7 @@ class Source:
             self.problems.append(Problem(parsed.file, 0, 0, dotted, "does not lead to a key of a mapping"))
             return
         for marks in (self.keys, self.values):
-            for stale in [known for known in marks if known[: len(path)] == path]:
+            for stale in [marked for marked in marks if marked[: len(path)] == path]:
                 del marks[stale]
         parent[path[-1]] = parsed.value if isinstance(value, str) else parsed.value[path[-1]]
         self.values[path] = Mark(parsed.file, 0, 0)
@@ -109,7 +109,7 @@ def path_text(path: Path) -> str:
 def parse(text: str, file: str) -> Source:
     """Read one YAML document; mistakes are noted in the result, not raised.
 
-    A text that was read before is not read again: a layout of hundreds of lines takes a second, and belongs to many documents.
+    Texts are cached: a layout of hundreds of lines takes a second to read, and many documents share it.
     """
     source = _parsed(text, file)
     return Source(file, deepcopy(source.value), dict(source.keys), dict(source.values), list(source.problems))
@@ -139,7 +139,7 @@ def _parsed(text: str, file: str) -> Source:
 
 
 def from_mapping(value: Mapping[str, Any], file: str) -> Source:
-    """Return a document that was built in Python; its mistakes have paths but no lines."""
+    """Return a document built in Python; its mistakes have paths but no lines."""
     source = Source(file)
 
     def plain(value: Any, path: Path) -> Any:
@@ -177,18 +177,18 @@ class _Reader:
             return [self.read(part, (*path, i), (*inside, id(node))) for i, part in enumerate(node.value)]
         try:
             return self.constructor.construct_object(node)
-        except Exception as error:  # ruamel lets through whatever Python raises on, say, `!!bool maybe`
+        except Exception as error:  # ruamel passes on any exception of Python's, such as on `!!bool maybe`
             return self.note(node, path, f"cannot read this value: {getattr(error, 'problem', None) or error}")
 
     def mapping(self, node: MappingNode, path: Path, inside: tuple[int, ...]) -> dict[str, Any]:
-        """Return a mapping; its own keys count before those merged in, and so do their places."""
+        """Return a mapping; its keys, and their places, override merged ones."""
         is_merge = [key.tag == "tag:yaml.org,2002:merge" or key.value == "<<" for key, _ in node.value]
         result: dict[str, Any] = {}
         for (_, value_node), is_merged in reversed(list(zip(node.value, is_merge, strict=True))):
             if is_merged:
                 result |= self.merged(value_node, path, inside)
         self.source.values[path] = self.mark(node)
-        own: set[str] = set()
+        seen: set[str] = set()
         for (key_node, value_node), is_merged in zip(node.value, is_merge, strict=True):
             if is_merged:
                 continue
@@ -196,29 +196,29 @@ class _Reader:
                 self.note(key_node, path, "a key must be a plain name")
                 continue
             key = str(key_node.value)
-            if key in own:
+            if key in seen:
                 first = self.source.keys[(*path, key)].line
                 self.note(key_node, (*path, key), f"this key stands twice, first in line {first}")
                 continue
-            own.add(key)
+            seen.add(key)
             self.source.keys[(*path, key)] = self.mark(key_node)
             result[key] = self.read(value_node, (*path, key), inside)
         return result
 
     def merged(self, node: Node, path: Path, inside: tuple[int, ...]) -> dict[str, Any]:
-        """Return what `<<` brings in: a mapping, or a list of mappings of which the first counts most."""
+        """Return the entries that `<<` merges in: from a mapping, or from a list of mappings, where earlier ones win."""
         result: dict[str, Any] = {}
         for part in reversed(node.value if isinstance(node, SequenceNode) else [node]):
-            found = self.read(part, path, inside)
-            if isinstance(found, dict):
-                result |= found
-            elif found is not Unreadable:
+            value = self.read(part, path, inside)
+            if isinstance(value, dict):
+                result |= value
+            elif value is not Unreadable:
                 self.note(part, path, "only a mapping can be merged in")
         return result
 
 
 def with_values(file: pathlib.Path, values: Mapping[tuple[str, ...], tuple[Any, str]]) -> str:
-    """Return a document's text with other values, each with a comment, by path; its own comments and order are kept."""
+    """Return a document's text with new values by path, each with a comment; its order and other comments stay."""
     yaml = YAML(typ="rt")
     yaml.preserve_quotes, yaml.width = True, 1000
     root = yaml.load(file.read_text(encoding="utf-8"))
