@@ -73,7 +73,7 @@ def test_mujoco_with_the_fault_in_its_solver_is_named(monkeypatch, version):
 
 
 def test_a_simulator_beside_another_versions_models_is_a_fault(monkeypatch):
-    assert told(known(monkeypatch, mujoco="3.18.1")) == {("fault", "MuJoCo 3.18.1 beside MuJoCo Warp 3.17.2")}
+    assert told(known(monkeypatch, mujoco="3.18.1")) == {("fault", "MuJoCo 3.18.1 with MuJoCo Warp 3.17.2")}
 
 
 def test_what_is_missing_says_what_cannot_be_done(monkeypatch):

@@ -1,6 +1,6 @@
-"""What an installation has: packages, devices, compilers and caches, and what follows where something is missing.
+"""The state of an installation: packages, devices, compilers and caches, and the consequences of missing parts.
 
-Nothing is imported that need not be: a package is known by its metadata, a compiler by its program.
+Imports are avoided: a package is detected by its metadata, a compiler by its program.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from tgdsl.errors import TgdslError
 from tgdsl.files import cache
 
 Level = Literal["fault", "slower", "missing", "note"]
-"""`fault`: what is installed computes wrongly, or refuses to work; `slower`: the same readings, later; `missing`: tgdsl can do
-something that is not to be had; `note`: nothing is to be done."""
+"""`fault`: an installed package computes wrongly or refuses to work; `slower`: the same readings take longer; `missing`: a
+feature is unavailable; `note`: no action is needed."""
 
 DEVELOPMENT = ("dev", "docs")  # the extras that only tgdsl's own development needs
 
@@ -50,7 +50,7 @@ WITHOUT: Mapping[str, tuple[Level, str]] = {
     "warp-lang": ("missing", "`query: raycast` is refused; analytic shapes and distance grids remain"),
     "zarr": ("missing", "`tgdsl export-dataset --to zarr` is refused"),
 }
-"""What follows if a package is not installed that tgdsl can do without."""
+"""Consequences of a missing optional package."""
 CPP = "C++, for modules on a CPU"
 OPENGL = ("glfw", "egl", "osmesa") if sys.platform == "linux" else ("glfw",)
 """Values of `MUJOCO_GL`: the first, MuJoCo's default, needs a display; on other systems there is no other."""
@@ -62,13 +62,13 @@ class Package:
     """A package that tgdsl uses."""
 
     name: str  # its name
-    installed: str | None  # the version that is installed; None: it is not
+    installed: str | None  # the installed version; None: not installed
     wanted: str  # the versions that tgdsl works with, as pip writes them
-    extra: str  # the extra that brings it, as in `pip install "tgdsl[gpu]"`; empty: it always comes
+    extra: str  # the extra that installs it, as in `pip install "tgdsl[gpu]"`; empty: always installed
 
     @property
     def fits(self) -> bool:
-        """Whether what is installed is among what is wanted; without the package, True."""
+        """Whether the installed version is among the wanted ones; True without the package."""
         return self.installed is None or Requirement(f"x{self.wanted}").specifier.contains(self.installed, prereleases=True)
 
 
@@ -78,25 +78,25 @@ class Finding:
 
     level: Level  # how bad it is
     what: str  # the result, in words
-    then: str  # what follows, or what to do
+    then: str  # the consequence, or what to do
 
 
 @dataclass(frozen=True)
 class Installation:
-    """What was found."""
+    """The state of an installation."""
 
     system: Mapping[str, str]  # python, operating system, processor, by name
     packages: tuple[Package, ...]  # the packages that tgdsl uses
-    devices: Mapping[str, str]  # where a module can be, and what of it torch says
-    compilers: Mapping[str, str | None]  # what compiles kernels, by name: its place or version; None: there is none
-    opengl: Mapping[str, bool]  # which values of `MUJOCO_GL` draw
-    # folders of what was compiled or computed before, and their sizes [bytes]; None: there is no such folder
+    devices: Mapping[str, str]  # devices for modules, with torch's description
+    compilers: Mapping[str, str | None]  # place or version of each compiler of kernels; None: there is none
+    opengl: Mapping[str, bool]  # whether each value of `MUJOCO_GL` draws
+    # cache folders and their sizes [bytes]; None: there is no such folder
     caches: Mapping[str, int | None]
-    findings: tuple[Finding, ...]  # what a user should know, the worst first
+    findings: tuple[Finding, ...]  # findings, the worst first
 
     @property
     def is_sound(self) -> bool:
-        """Whether nothing that was found is a fault."""
+        """Whether no finding is a fault."""
         return all(finding.level != "fault" for finding in self.findings)
 
     def __str__(self) -> str:
@@ -118,16 +118,14 @@ class Installation:
 
 
 def examine() -> Installation:
-    """Look at this installation; raise `TgdslError` if tgdsl itself is not installed, so that nobody knows what it wants."""
-    known, places, drawn_by = packages(), devices(), opengl()
-    compiled_by = compilers(known)
-    return Installation(
-        system(), known, places, compiled_by, drawn_by, caches(), findings(known, compiled_by, places, drawn_by)
-    )
+    """Examine this installation; raise `TgdslError` if tgdsl is not installed: its metadata lists the wanted packages."""
+    used, places, drawn_by = packages(), devices(), opengl()
+    compiled_by = compilers(used)
+    return Installation(system(), used, places, compiled_by, drawn_by, caches(), findings(used, compiled_by, places, drawn_by))
 
 
 def system() -> dict[str, str]:
-    """Return tgdsl's version, Python's, the operating system's, and how many processors there are."""
+    """Return the versions of tgdsl, Python and the operating system, and the number of processors."""
     return {
         "tgdsl": importlib.metadata.version("tgdsl"),
         "Python": platform.python_version(),
@@ -137,7 +135,7 @@ def system() -> dict[str, str]:
 
 
 def packages(requirements: Sequence[str] | None = None) -> tuple[Package, ...]:
-    """Return the packages that tgdsl uses, but not for its own development.
+    """Return the packages that tgdsl uses, without those for its development only.
 
     `requirements` are as in the metadata of a package; default: tgdsl's.
     """
@@ -146,7 +144,7 @@ def packages(requirements: Sequence[str] | None = None) -> tuple[Package, ...]:
             requirements = importlib.metadata.requires("tgdsl") or []
         except importlib.metadata.PackageNotFoundError as error:
             raise TgdslError("tgdsl is not installed, it is only imported: pip install -e .") from error
-    known: dict[str, Package] = {}
+    result: dict[str, Package] = {}
     for text in requirements:
         requirement = Requirement(text)
         marker = str(requirement.marker or "")
@@ -156,9 +154,9 @@ def packages(requirements: Sequence[str] | None = None) -> tuple[Package, ...]:
         name = requirement.name.lower().replace("_", "-").replace(".", "-")
         if extra in DEVELOPMENT and name not in WITHOUT:
             continue
-        if name not in known or known[name].extra in DEVELOPMENT:
-            known[name] = Package(name, installed_version(name), str(requirement.specifier), extra)
-    return tuple(sorted(known.values(), key=lambda package: (package.extra != "", package.name)))
+        if name not in result or result[name].extra in DEVELOPMENT:
+            result[name] = Package(name, installed_version(name), str(requirement.specifier), extra)
+    return tuple(sorted(result.values(), key=lambda package: (package.extra != "", package.name)))
 
 
 def installed_version(name: str) -> str | None:
@@ -170,7 +168,7 @@ def installed_version(name: str) -> str | None:
 
 
 def devices() -> dict[str, str]:
-    """Return where a module can be, by torch's name."""
+    """Return the devices for modules, by torch's name."""
     import torch
 
     places = {"cpu": f"{torch.get_num_threads()} threads"}
@@ -181,7 +179,7 @@ def devices() -> dict[str, str]:
 
 
 def compilers(known: Sequence[Package]) -> dict[str, str | None]:
-    """Return what compiles kernels."""
+    """Return the compilers of kernels."""
     from tgdsl.module.calls import cpp_compiler
 
     versions = {package.name: package.installed for package in known}
@@ -193,7 +191,7 @@ def compilers(known: Sequence[Package]) -> dict[str, str | None]:
 
 
 def opengl() -> dict[str, bool]:
-    """Return which values of `MUJOCO_GL` draw, each tried in a process of its own: MuJoCo takes one for good."""
+    """Return whether each value of `MUJOCO_GL` draws, tried in separate processes: MuJoCo reads the value once."""
     tried = {
         name: subprocess.Popen([sys.executable, "-c", _DRAW], env=os.environ | {"MUJOCO_GL": name}, stderr=subprocess.DEVNULL)
         for name in OPENGL
@@ -202,7 +200,7 @@ def opengl() -> dict[str, bool]:
 
 
 def caches() -> dict[str, int | None]:
-    """Return the folders of what is kept between runs, and their sizes [bytes]."""
+    """Return the cache folders and their sizes [bytes]."""
     from tgdsl.tensors.torch_internals import inductor_cache
 
     sizes: dict[str, int | None] = {str(cache.folder()): sum(entry.size for entry in cache.entries())}
@@ -221,7 +219,7 @@ def folder_size(folder: Path) -> int:
 def findings(
     known: Sequence[Package], compiled_by: Mapping[str, str | None], places: Mapping[str, str], drawn_by: Mapping[str, bool]
 ) -> tuple[Finding, ...]:
-    """Return what a user should know of some packages, compilers, devices and ways to OpenGL, the worst first."""
+    """Return findings on packages, compilers, devices and OpenGL, the worst first."""
     has_gpu = any(name.startswith("cuda") for name in places)
     results = [finding for package in known if (finding := _of_package(package, has_gpu))] + _known_faults(known)
     if compiled_by[CPP] is None:
@@ -232,14 +230,14 @@ def findings(
         results.append(Finding("note", "torch sees no GPU", then))
     setting = os.environ.get("MUJOCO_GL", OPENGL[0])
     if not drawn_by.get(setting, True):
-        others = [f"MUJOCO_GL={name}" for name, draws in drawn_by.items() if draws]
-        then = f"set {others[0]}" if others else "install libegl1 or libosmesa6; pictures of `tgdsl run` need none"
+        drawing = [f"MUJOCO_GL={name}" for name, draws in drawn_by.items() if draws]
+        then = f"set {drawing[0]}" if drawing else "install libegl1 or libosmesa6; pictures of `tgdsl run` need none"
         results.append(Finding("missing", f"no OpenGL by MUJOCO_GL={setting}: `tgdsl play --video` is refused", then))
     return tuple(sorted(results, key=lambda finding: get_args(Level).index(finding.level)))
 
 
 def _of_package(package: Package, has_gpu: bool) -> Finding | None:
-    """Return what follows if a package is missing, or has a wrong version."""
+    """Return the finding on a package that is missing or has a wrong version."""
     name, install = package.name, f'pip install "{package.name}{package.wanted}"'
     if not package.fits:
         return Finding("fault", f"{name} is {package.installed}, expected {package.wanted}", install)
@@ -250,12 +248,12 @@ def _of_package(package: Package, has_gpu: bool) -> Finding | None:
     if name not in WITHOUT or (name == "triton" and not has_gpu):
         return None
     level, then = WITHOUT[name]
-    wanted = name if package.extra in DEVELOPMENT else f'"tgdsl[{package.extra}]"'
-    return Finding(level, f"{name} is not installed", f"{then} (pip install {wanted})")
+    target = name if package.extra in DEVELOPMENT else f'"tgdsl[{package.extra}]"'
+    return Finding(level, f"{name} is not installed", f"{then} (pip install {target})")
 
 
 def _known_faults(known: Sequence[Package]) -> list[Finding]:
-    """Return faults of what is installed that tgdsl's own range of versions does not tell of."""
+    """Return known faults of installed versions that tgdsl's requirements allow."""
     versions = {package.name: package.installed for package in known}
     results = []
     mujoco, warp, torch = (versions.get(name) for name in ("mujoco", "mujoco-warp", "torch"))
@@ -263,9 +261,9 @@ def _known_faults(known: Sequence[Package]) -> list[Finding]:
         problem = "MuJoCo 4.0.0 has a fault in its solver where Jacobians are sparse"
         results.append(Finding("fault", problem, "forces are wrong there: take another version"))
     if mujoco and warp and Version(mujoco).release[:2] != Version(warp).release[:2]:
-        problem = f"MuJoCo {mujoco} beside MuJoCo Warp {warp}"
+        problem = f"MuJoCo {mujoco} with MuJoCo Warp {warp}"
         results.append(Finding("fault", problem, "their models differ between such versions: take the same of both"))
     if torch and Version(torch) >= Version("2.11"):
         problem = f"torch {torch} compiles a copy wrongly whose source is changed after it (pytorch#198131)"
-        results.append(Finding("note", problem, "tgdsl compiles nothing that does so; look out in a step of your own"))
+        results.append(Finding("note", problem, "tgdsl compiles no such copy; avoid them in your own steps"))
     return results

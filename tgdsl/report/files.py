@@ -64,7 +64,7 @@ def page_of(
 
 
 def table_of(header: Iterable[str], rows: Iterable[Iterable[str]], classes: Iterable[str] = ()) -> str:
-    """Return a table of texts; `classes` are those of the rows, if any."""
+    """Return a table of texts; `classes`: the rows' CSS classes, if any."""
     lines = ["<table><tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in header) + "</tr>"]
     names = iter(classes)
     for row in rows:
@@ -75,7 +75,7 @@ def table_of(header: Iterable[str], rows: Iterable[Iterable[str]], classes: Iter
 
 
 def svg_of(figure: Figure, salt: str) -> str:
-    """Return a figure as SVG for HTML, the same bytes each time; `salt` tells its identifiers from those of other plots."""
+    """Return a figure as SVG for HTML, the same bytes each time; `salt` makes its identifiers unique among plots."""
     text = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": salt, "svg.fonttype": "none"}):
         FigureCanvasSVG(figure).print_svg(text, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})

@@ -17,7 +17,7 @@ def row(variant, seconds, half=0.1, rms=1e-3, is_on_front=True, subject="touch",
 def test_the_same_twice():
     """Times differ, and nothing is said of that."""
     found = compared_rows([row("a", 1.0), row("b", 2.0)], [row("a", 1.3), row("b", 2.4)])
-    assert found.lines() == ["errors and counts are those of the earlier bench", "the front is that of the earlier bench"]
+    assert found.lines() == ["errors and counts are as in the earlier bench", "the front is as in the earlier bench"]
 
 
 def test_who_is_as_fast_may_change_places():
@@ -25,7 +25,7 @@ def test_who_is_as_fast_may_change_places():
     before = [row("a", 1.0), row("b", 1.3, is_on_front=False)]
     found = compared_rows([row("a", 1.2), row("b", 1.1)], before)
     assert found.turned == () and found.tied == ("touch: b, float32",)
-    assert found.lines()[-1] == "the front is that of the earlier bench, but for ties: touch: b, float32"
+    assert found.lines()[-1] == "the front is as in the earlier bench, except for ties: touch: b, float32"
 
 
 def test_who_was_faster_and_is_slower_is_named():
@@ -50,7 +50,7 @@ def test_other_errors_and_variants_are_named():
     found = compared_rows([row("a", 1.0, rms=2e-3, operations=13), row("new", 1.0)], before)
     assert (found.only_before, found.only_now) == (("touch: old, float32",), ("touch: new, float32",))
     assert found.changed == {"touch: a, float32": ("rms 0.001 → 0.002", "operations 12 → 13")}
-    assert "errors and counts are those of the earlier bench" not in found.lines()
+    assert "errors and counts are as in the earlier bench" not in found.lines()
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"rows": [{"subject": 1}]}', '{"rows": 3}', '{"rows": [3]}'])

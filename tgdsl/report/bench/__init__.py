@@ -1,1 +1,1 @@
-"""Speed against error of a document's sensors and physics, on states of its own scene."""
+"""Speed against error of a document's sensors and physics, on states of its scene."""

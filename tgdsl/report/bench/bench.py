@@ -48,20 +48,20 @@ class Options:
     num_envs: tuple[int, ...] = (256,)  # environments of timed calls
     repeats: int = 11  # timed calls of each variant
     compiled: bool = False  # whether modules are compiled by torch before they are timed
-    seed: int = 0  # of bootstraps, and of which states are timed
+    seed: int = 0  # seed of bootstraps and of the choice of timed states
 
 
 @dataclass(frozen=True)
 class Bench:
-    """What is measured."""
+    """A document and what to measure of it."""
 
     document: Document
     overrides: Mapping[str, Any] = field(default_factory=dict)
-    sensors: tuple[str, ...] = ()  # sensors, and `physics`, that are measured; empty: all
+    sensors: tuple[str, ...] = ()  # sensors to measure, and `physics`; empty: all
     states: Path | None = None  # file of states; None: a scripted run
-    save_states: Path | None = None  # file that the states of the run are written to; None: none
+    save_states: Path | None = None  # file to which the run's states are written; None: no file
     state_envs: int = 16  # environments of the scripted run; half of them verify
-    steps: int = 90  # its control steps, about
+    steps: int = 90  # its control steps, approximately
     substeps: int = 5  # physics steps of each
     options: Options = field(default_factory=Options)
 
@@ -85,23 +85,23 @@ class Way(NamedTuple):
 
     @contextmanager
     def matmul(self) -> Iterator[None]:
-        """Allow matrix products in TF32 where that is the precision."""
-        before = torch.backends.cuda.matmul.allow_tf32
+        """Allow TF32 matrix products if that is the precision."""
+        previous = torch.backends.cuda.matmul.allow_tf32
         torch.backends.cuda.matmul.allow_tf32 = self.precision == "tf32"
         try:
             yield
         finally:
-            torch.backends.cuda.matmul.allow_tf32 = before
+            torch.backends.cuda.matmul.allow_tf32 = previous
 
 
 def bench(what: Bench, progress: Progress = silent, begun: Callable[[int, int], None] | None = None) -> Report:
-    """Measure; `begun` is called with the number of subjects done, and of all, each time that one begins.
+    """Measure; `begun` is called at the start of each subject with the number of finished subjects and of all.
 
     Raises:
-        SpecError: What is wrong with the document.
+        SpecError: The document's mistakes.
         StateError: If the states are of another document.
         SimulationError: If the scene cannot be simulated.
-        TgdslError: If there is no such sensor, or a number is none that can be measured with.
+        TgdslError: If there is no such sensor, or a number is out of range.
     """
     options = what.options
     if not options.num_envs or min(options.num_envs) < 1:
@@ -112,38 +112,38 @@ def bench(what: Bench, progress: Progress = silent, begun: Callable[[int, int], 
     progress("compiling")
     choice = choose(what.document, what.overrides, progress=progress)
     touch = TactileModule(compile_document(what.document, what.overrides, progress=progress, choice=choice).plan, known_kinds())
-    what = replace(what, overrides={**what.overrides, **choice.changes})
-    names = tuple(dict.fromkeys(sensor.sensor for sensor in touch.plan.sensors))
-    wanted = _wanted(what.sensors, names)
-    recording = _recording(what, names, progress)
+    resolved = replace(what, overrides={**what.overrides, **choice.changes})
+    sensors = tuple(dict.fromkeys(sensor.sensor for sensor in touch.plan.sensors))
+    names = _subject_names(resolved.sensors, sensors)
+    recording = _recording(resolved, sensors, progress)
     subjects: list[Subject] = []
-    for name in wanted:
+    for name in names:
         if begun is not None:
-            begun(len(subjects), len(wanted))
+            begun(len(subjects), len(names))
         if name == PHYSICS:
             script = script_of(touch, progress=progress)
-            run = (what.state_envs, what.steps, what.substeps, options.seed)
+            run = (resolved.state_envs, resolved.steps, resolved.substeps, options.seed)
             subject = measure_physics(touch.plan, script, *run, progress)
         else:
-            subject = measure(Sensor.of(what.document, what.overrides, name), recording, options, progress)
+            subject = measure(Sensor.of(resolved.document, resolved.overrides, name), recording, options, progress)
         subjects.append(replace(subject, chosen=choice.notes.get(name, ())))
     if begun is not None:
-        begun(len(wanted), len(wanted))
+        begun(len(names), len(names))
     title = str(what.document) if not isinstance(what.document, Mapping) else "<mapping>"
     return Report(title, _machine(options.device), recording.source, tuple(subjects))
 
 
-def _wanted(sensors: Collection[str], names: Sequence[str]) -> list[str]:
-    """Return what is measured, in the document's order."""
-    known = [*names, *([] if PHYSICS in names else [PHYSICS])]
-    for name in sensors:
-        if name not in known:
-            raise TgdslError(f'there is no sensor "{name}"; {did_you_mean(name, known, "sensors")}')
-    return [name for name in known if not sensors or name in sensors]
+def _subject_names(requested: Collection[str], sensors: Sequence[str]) -> list[str]:
+    """Return the names of the subjects to measure, in the document's order."""
+    names = [*sensors, *([] if PHYSICS in sensors else [PHYSICS])]
+    for name in requested:
+        if name not in names:
+            raise TgdslError(f'there is no sensor "{name}"; {did_you_mean(name, names, "sensors")}')
+    return [name for name in names if not requested or name in requested]
 
 
 def _recording(what: Bench, names: Sequence[str], progress: Progress) -> Recording:
-    """Return states of all fields that any sensor wants without its imperfections."""
+    """Return states with the fields of all sensors without imperfections."""
     if what.states is not None:
         return load_recording(what.states)
     changes = {key: value for name in names for key, value in bare(name).items()}
@@ -164,8 +164,8 @@ def _machine(device: torch.device) -> str:
 def measure(sensor: Sensor, recording: Recording, options: Options, progress: Progress = silent) -> Subject:
     """Return a sensor in all its variants.
 
-    Errors are those of all readings of the recorded states against the finest variant in float64. The front is drawn from the
-    first half of the environments; the others verify it.
+    Errors are over all readings of the recorded states, against the finest variant in float64. The front is drawn from the
+    first half of the environments; the other half verifies it.
     """
     plans, left_out = {sensor.variants.own: sensor.own}, {}
     for variant in (*sensor.variants.fields, *sensor.variants.queries):
@@ -200,7 +200,7 @@ def measure(sensor: Sensor, recording: Recording, options: Options, progress: Pr
 
 
 def _errors(sensor: Sensor, way: Way, recording: Recording, exact: Exact, options: Options, progress: Progress) -> Measured:
-    """Return a variant with its errors and its counted cost, but no times."""
+    """Return a variant with its errors and its counted cost, without times."""
     progress(f"{sensor.name}: {way.name}, errors")
     touch = way.module(options.device)
     with way.matmul():
@@ -210,13 +210,13 @@ def _errors(sensor: Sensor, way: Way, recording: Recording, exact: Exact, option
     common = common_of(exact.module, touch, sensor.name)
     readings, expected = common.of_other(readings), common.of_one(exact.readings)
     magnitude, channels = exact.magnitude._replace(active=common.of_one(exact.magnitude.active)), range(readings.shape[-1])
-    chosen, verified = (
+    drawn, verified = (
         errors_of(readings[:, half], expected[:, half], magnitude.of(half, channels), seed=options.seed)
         for half in halves(recording.num_envs)
     )
     size = 2 if way.precision == "bfloat16 readings" else torch.finfo(touch.dtype).bits // 8
     is_own = way.variant.is_own and way.precision == "float32"
-    return Measured(way.variant.label, way.precision, is_own, chosen, verified, {}, cost_of(touch, size))
+    return Measured(way.variant.label, way.precision, is_own, drawn, verified, {}, cost_of(touch, size))
 
 
 def _call(way: Way, recording: Recording, num_envs: int, name: str, options: Options) -> Callable[[], Tensor]:
@@ -234,21 +234,21 @@ def _call(way: Way, recording: Recording, num_envs: int, name: str, options: Opt
 
 
 def some_of(states: Sequence[SceneState], num_envs: int, seed: int) -> SceneState:
-    """Return a state of any number of environments: drawn from those of some states, at any step."""
+    """Return a state of any number of environments, drawn from all environments and steps of some states."""
     num = len(states) * (0 if states[0].body_pos is None else states[0].body_pos.shape[0])
-    chosen = torch.from_numpy(np.random.default_rng(seed).integers(num, size=num_envs))
+    ids = torch.from_numpy(np.random.default_rng(seed).integers(num, size=num_envs))
     values: dict[str, Any] = {}
     for name in SHAPES:
         if getattr(states[0], name) is not None:
-            values[name] = torch.cat([getattr(state, name) for state in states])[chosen]
+            values[name] = torch.cat([getattr(state, name) for state in states])[ids]
     parts = [some_of(part, num_envs, seed) for part in zip(*(state.substeps for state in states), strict=True)]
     return SceneState(**values, dt=states[0].dt, substeps=tuple(parts))
 
 
 def _check(sensor: Sensor, states: Sequence[SceneState]) -> str:
-    """Return how far the document's own variant in float64 is from the kind's float64 definition."""
+    """Return the difference of the document's variant in float64 from the kind's float64 definition, as text."""
     if queried_objects(sensor.own):
-        return "the kind's definition knows primitives alone, and meshes are felt"
+        return "not compared with the kind's definition, which supports primitives only: the sensor reads meshes"
     few = [only(state, slice(CHECKED_ENVS)) for state in states[-CHECKED_STEPS:]]
     touch = TactileModule(sensor.own, known_kinds(), torch.float64)
     reference, expected = ReferenceModule(sensor.own, sensor.kind, sensor.spec, sensor.others, sensor.name), []

@@ -1,8 +1,7 @@
-"""Two benches of a document beside each other: whether errors are the same, and whether times tell variants apart alike.
+"""Compare two benches of a document: whether errors are equal, and whether times rank the variants equally.
 
-Times differ from run to run, so that a variant which is as fast as another may be on the front in one run and not in the next.
-Two fronts agree if no two variants changed places: if none that was faster than another, with intervals apart, is slower now,
-with intervals apart.
+Times vary from run to run: of two equally fast variants either may be on the front. Two fronts agree if no two variants changed
+places: no variant was faster than another with disjoint intervals, and is now slower with disjoint intervals.
 """
 
 from __future__ import annotations
@@ -19,29 +18,29 @@ from tgdsl.report.bench.results import Report, rows_of
 
 Row = Mapping[str, Any]
 OF_TIME = ("seconds_", "times_own", "is_on_front", "is_own")
-"""How the names of columns begin that may differ from run to run, or with what the document says."""
+"""Prefixes of columns that may differ from run to run, or with the document."""
 
 
 class Comparison(NamedTuple):
-    """What two benches differ in."""
+    """The differences of two benches."""
 
-    only_before: tuple[str, ...]  # variants that the earlier one alone has
-    only_now: tuple[str, ...]  # variants that the later one alone has
+    only_before: tuple[str, ...]  # variants of the earlier bench only
+    only_now: tuple[str, ...]  # variants of the later bench only
     changed: Mapping[str, tuple[str, ...]]  # variants whose errors or counts differ, with each number before and now
-    turned: tuple[tuple[str, str], ...]  # pairs of variants of which the first was faster, and is slower now
-    tied: tuple[str, ...]  # variants that are on one front alone, and are as fast as what takes their place
+    turned: tuple[tuple[str, str], ...]  # pairs of variants whose first was faster, and is slower now
+    tied: tuple[str, ...]  # variants on one front only, as fast as the variants that replace them
 
     def lines(self) -> list[str]:
-        """Return what is said of it."""
+        """Return the differences as text."""
         lines = [f"only in the earlier bench: {name}" for name in self.only_before]
         lines += [f"not in the earlier bench: {name}" for name in self.only_now]
         lines += [f"{name}: {listed(changes, 4)}" for name, changes in self.changed.items()]
         lines += [f"{one} was faster than {other}, and is slower now" for one, other in self.turned]
         if not self.changed:
-            lines.append("errors and counts are those of the earlier bench")
+            lines.append("errors and counts are as in the earlier bench")
         if not self.turned:
-            ties = f", but for ties: {listed(self.tied)}" if self.tied else ""
-            lines.append(f"the front is that of the earlier bench{ties}")
+            ties = f", except for ties: {listed(self.tied)}" if self.tied else ""
+            lines.append(f"the front is as in the earlier bench{ties}")
         return lines
 
 
@@ -64,12 +63,12 @@ def read_rows(file: Path) -> list[Row]:
 
 
 def compared(report: Report, before: Sequence[Row]) -> Comparison:
-    """Return what a bench and the rows of an earlier one differ in; only of the sensors that both have measured."""
+    """Return the differences of a bench and an earlier one's rows, for sensors that both measured."""
     return compared_rows(list(rows_of(report)), before)
 
 
 def compared_rows(now: Sequence[Row], before: Sequence[Row]) -> Comparison:
-    """Return what the rows of two benches differ in: see `compared`."""
+    """Return the differences of two benches' rows: see `compared`."""
     subjects = {row["subject"] for row in now} & {row["subject"] for row in before}
     new, old = (_by_name([row for row in rows if row["subject"] in subjects]) for rows in (now, before))
     both = [name for name in new if name in old]
@@ -101,7 +100,7 @@ def _brief(value: Any) -> str:
 
 
 def _is_faster(one: Row, other: Row) -> bool:
-    """Whether a variant is faster than another, with intervals apart, with the most environments that both were timed with."""
+    """Whether a variant is faster, with disjoint intervals, at the largest number of environments timed for both."""
     shared = {name for name in one if name.startswith("seconds_") and name.endswith("_envs")} & set(other)
     if not shared:
         return False

@@ -55,7 +55,7 @@ def bench_text(report: Report) -> str:
         marks = [("now" if p.is_own else "") + (" ●" if p.is_on_front else "") for p in subject.points]
         table = text_table((*header, ""), [(*row, mark.strip()) for row, mark in zip(rows, marks, strict=True)])
         lines = [f"{subject.name} ({subject.kind}), against {subject.reference}", subject.check, *subject.chosen, table]
-        lines += [f"not to be had: {label}: {why}" for label, why in subject.left_out]
+        lines += [f"not available: {label}: {why}" for label, why in subject.left_out]
         parts.append("\n".join(filter(None, lines)))
     parts.append("now: what the compiler takes; ●: on the front of time and RMS error, overlapping intervals being equal")
     return "\n\n".join(parts)
@@ -71,7 +71,7 @@ def _section(subject: Subject, index: int) -> str:
         plot(subject, f"tgdsl{index}"),
         table_of(header, rows, map(_classes, subject.points)),
     ]
-    lines += [f'<p class="note">not to be had: {escape(label)}: {escape(why)}</p>' for label, why in subject.left_out]
+    lines += [f'<p class="note">not available: {escape(label)}: {escape(why)}</p>' for label, why in subject.left_out]
     return "\n".join([*lines, "</section>"])
 
 
@@ -81,8 +81,8 @@ def _classes(point: Measured) -> str:
 
 def cells_of(subject: Subject) -> Iterator[tuple[str, ...]]:
     """Yield the header and a row for each variant, for people to read."""
-    own = subject.own
-    times = tuple(f"ms, {num} envs" for num in own.times)
+    current = subject.own
+    times = tuple(f"ms, {num} envs" for num in current.times)
     costs = ("operations", "constants", "state", "output")
     yield ("variant", "precision", "RMS error", "99 % within", "largest", "RMS, verified", *times, "× now", *costs)
     for point in subject.points:
@@ -97,7 +97,7 @@ def cells_of(subject: Subject) -> Iterator[tuple[str, ...]]:
             f"{point.chosen.largest.value:.1e}" if point.chosen.is_finite and point.verified.is_finite else "not finite",
             f"{point.verified.rms.value:.1e}",
             *spans,
-            f"{point.time.value / own.time.value:.2f}",
+            f"{point.time.value / current.time.value:.2f}",
             operations,
             *map(_bytes, cost),
         )
@@ -150,7 +150,7 @@ def _draw(axes: Axes, point: Measured) -> None:
 
 
 def _label(axes: Axes, points: Sequence[Measured]) -> None:
-    """Write beside each point what it is, where no other label stands: to its right or left, and further up or down."""
+    """Label each point without overlap: to its right or left, and further up or down."""
     figure = axes.get_figure()
     assert isinstance(figure, Figure)
     renderer, taken = FigureCanvasAgg(figure).get_renderer(), []

@@ -55,9 +55,9 @@ def measure_physics(
 ) -> Subject:
     """Return the physics of a scene under several options.
 
-    Errors are of joint angles and positions along the run, relative to how far they move, against a run with a time step
-    `FINE` times smaller, as the document's cone has it. Step by step all runs take turns, on the CPU, with `substeps` physics
-    steps as the document is written.
+    Errors are of joint angles and positions along the run, relative to their motion, against a run with a time step `FINE`
+    times smaller and the document's cone. All runs take turns step by step, on the CPU; the document's setting has `substeps`
+    physics steps.
 
     Raises:
         SimulationError: If the scene cannot be simulated.
@@ -67,7 +67,7 @@ def measure_physics(
     tried = [*settings(model, substeps), Setting("fine", fine, FINE * substeps)]
     phases = 1 if script.keyframes is None and script.closing is None else 3
     seconds = steps / phases * substeps * model.opt.timestep
-    inputs = dataclasses.replace(plan.inputs, substeps=1)  # no sensor is read, so those of blocks want no steps of theirs
+    inputs = dataclasses.replace(plan.inputs, substeps=1)  # no sensor is read, not even one of blocks
     unread = dataclasses.replace(plan, inputs=inputs)
     runs = [
         script.begin(TactileModule(unread, known_kinds()), num_envs, setting.substeps, seconds, setting.options)
@@ -116,12 +116,12 @@ def _subject(
     for k, setting in enumerate(tried[:-1]):
         if k in faults:
             continue
-        chosen, verified = (
+        drawn, verified = (
             errors_of(paths[k][:, half], exact[:, half], magnitude.of(half, range(len(quantities))), seed=seed)
             for half in halves(num_envs)
         )
         time_of_step = {num_envs: median_of(np.array(times[k]))}
-        points.append(Measured(setting.label, "float64", setting.is_own, chosen, verified, time_of_step, cost))
+        points.append(Measured(setting.label, "float64", setting.is_own, drawn, verified, time_of_step, cost))
     units = {"angle": "rad", "position": "m"}
     scales = {name: f"{scale:.4g} {units[name]}" for name, scale in zip(quantities, magnitude.scale, strict=True)}
     baseline = f"time step 1/{FINE}, up to {ITERATIONS} iterations to {TOLERANCE:g}"
@@ -130,7 +130,7 @@ def _subject(
 
 
 def coordinates(model: mujoco.MjModel) -> tuple[list[int], list[str]]:
-    """Return which of `qpos` are joint angles and positions, and which of both each is; orientations are left out."""
+    """Return the indices in `qpos` of joint angles and positions, and the quantity of each; orientations are left out."""
     columns, quantities = [], []
     for joint in range(model.njnt):
         first, kind = int(model.jnt_qposadr[joint]), int(model.jnt_type[joint])

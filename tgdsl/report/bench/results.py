@@ -26,13 +26,13 @@ class Measured:
     """A variant, measured."""
 
     label: str  # what to call it
-    precision: str  # of what is computed and returned
-    is_own: bool  # whether it is what the compiler takes now
+    precision: str  # precision of the computation and of the readings
+    is_own: bool  # whether it is the compiler's present choice
     chosen: Errors  # errors on the environments that the front is drawn from, relative to the reading's magnitude
-    verified: Errors  # the same on the others
+    verified: Errors  # errors on the other environments
     times: Mapping[int, Interval]  # median time of a call [s], by the number of environments
-    cost: Cost  # what it takes, counted
-    # whether no other is better in time or error, and worse in neither; where intervals overlap two are equal
+    cost: Cost  # its counted cost
+    # whether no other point is better in time or error and worse in neither; overlapping intervals count as equal
     is_on_front: bool = False
 
     @property
@@ -47,16 +47,16 @@ class Subject:
 
     name: str  # its name
     kind: str  # its kind
-    reference: str  # what errors are measured against
-    check: str  # how far that is from the kind's float64 definition; empty: not compared
-    magnitudes: Mapping[str, str]  # what each quantity's errors are relative to, with its unit
+    reference: str  # reference of the errors
+    check: str  # its difference from the kind's float64 definition; empty: not compared
+    magnitudes: Mapping[str, str]  # magnitude to which each quantity's errors are relative, with its unit
     points: tuple[Measured, ...]  # the variants
-    left_out: tuple[tuple[str, str], ...]  # variants that cannot be had, and why
-    chosen: tuple[str, ...] = ()  # what `accuracy` chose and why, line by line; empty: there is none
+    left_out: tuple[tuple[str, str], ...]  # unavailable variants, and why
+    chosen: tuple[str, ...] = ()  # the choice of `accuracy` and its reasons, line by line; empty without `accuracy`
 
     @property
     def own(self) -> Measured:
-        """What the compiler takes now."""
+        """The compiler's present choice."""
         return next(point for point in self.points if point.is_own)
 
 
@@ -71,15 +71,15 @@ class Report:
 
 
 def with_front(points: Sequence[Measured]) -> tuple[Measured, ...]:
-    """Return the points, marked where no other is better in time or RMS error and worse in neither."""
+    """Return the points; the front is marked: no other point is better in time or RMS error and worse in neither."""
     is_on_front = front_of([(point.time, point.chosen.rms) for point in points])
     return tuple(replace(point, is_on_front=is_on) for point, is_on in zip(points, is_on_front, strict=True))
 
 
 def rows_of(report: Report) -> Iterator[dict[str, Any]]:
-    """Yield a row for each variant: what stands in the files."""
+    """Yield a row of the files for each variant."""
     for subject in report.subjects:
-        own = subject.own
+        current = subject.own
         for point in subject.points:
             row: dict[str, Any] = {"subject": subject.name, "kind": subject.kind}
             row |= {"variant": point.label, "precision": point.precision, "is_own": point.is_own}
@@ -89,7 +89,7 @@ def rows_of(report: Report) -> Iterator[dict[str, Any]]:
                 row |= {f"{half}p99": errors.p99, f"{half}is_finite": errors.is_finite}
             for num_envs, interval in point.times.items():
                 row |= _spread(f"seconds_{num_envs}_envs", interval)
-            row |= {"times_own": point.time.value / own.time.value, "operations": point.cost.operations}
+            row |= {"times_own": point.time.value / current.time.value, "operations": point.cost.operations}
             row |= {f"{name}_bytes": getattr(point.cost, name) for name in ("constants", "state", "output")}
             yield row
 
@@ -99,9 +99,9 @@ def _spread(name: str, interval: Interval) -> dict[str, float]:
 
 
 def median_of(times: Float[np.ndarray, " call"]) -> Interval:
-    """Return the median and its 95 % interval: the order statistics that a binomial distribution of 1/2 gives.
+    """Return the median and its 95 % interval: the order statistics from a binomial distribution with p = 1/2.
 
-    Of fewer than six calls no two order statistics are 95 % certain: the interval is then from the least to the largest.
+    With fewer than six calls no interval is 95 % certain: it is then from the smallest to the largest.
     """
     ordered = np.sort(times)
     below = max(int(binom.ppf(0.025, len(ordered), 0.5)) - 1, 0)
@@ -109,7 +109,7 @@ def median_of(times: Float[np.ndarray, " call"]) -> Interval:
 
 
 def times_of(calls: Mapping[str, Callable[[], Any]], repeats: int, device: torch.device) -> dict[str, Interval]:
-    """Return the median time of each call [s]; calls are made in turn, so that a machine that drifts disturbs all alike."""
+    """Return the median time of each call [s]; the calls take turns, so that a machine's drift affects all equally."""
     times: dict[str, list[float]] = {name: [] for name in calls}
 
     def wait() -> None:
@@ -129,11 +129,11 @@ def times_of(calls: Mapping[str, Callable[[], Any]], repeats: int, device: torch
 
 
 def dominates(one: Sequence[Interval], other: Sequence[Interval]) -> bool:
-    """Return whether a point is better in something, and worse in nothing; overlapping intervals are equal."""
+    """Return whether a point is better in one coordinate and worse in none; overlapping intervals are equal."""
     apart = [(a, b) for a, b in zip(one, other, strict=True) if not a.overlaps(b)]
     return bool(apart) and all(a.value < b.value for a, b in apart)
 
 
 def front_of(points: Sequence[Sequence[Interval]]) -> list[bool]:
-    """Return which points no other point dominates."""
+    """Return whether each point is dominated by no other."""
     return [not any(dominates(other, point) for other in points if other is not point) for point in points]
