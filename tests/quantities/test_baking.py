@@ -23,7 +23,7 @@ def test_a_mesh_that_is_not_closed_is_baked_with_a_warning(monkeypatch, tmp_path
         geom_distance(SurfaceGeom(GEOM, surface_of(cup)), coarse, 0.004, "object item")
     cup.update_faces(cup.face_normals[:, 2] < 0.5)
     with pytest.warns(
-        UserWarning, match='^object item: geom "cup" is not closed; what is inside is decided by its winding number$'
+        UserWarning, match='^object item: geom "cup" is not closed; its winding number decides which points are inside$'
     ):
         geom_distance(SurfaceGeom(GEOM, surface_of(cup)), coarse, 0.004, "object item")
 

@@ -118,7 +118,7 @@ def test_an_open_mesh_gets_a_lid_and_a_warning(tmp_path, query, is_inverted):
     cup = box(CUBE)
     cup.update_faces(cup.face_normals[:, 2] < 0.5)
     pos = [(0, 0, -0.017), (0, 0, 0.017), (0.001, 0, 0.023)]
-    what = r'^object item: geom "item" is not closed; what is inside is decided by its winding number$'
+    what = r'^object item: geom "item" is not closed; its winding number decides which points are inside$'
     with pytest.warns(UserWarning, match=what) as caught:
         found = mesh_read(tmp_path, [inverted(cup) if is_inverted else cup], pos, query)
     assert sum("not closed" in str(warning.message) for warning in caught) == 1

@@ -21,19 +21,19 @@ PRIMITIVES = ("plane", "sphere", "capsule", "cylinder", "ellipsoid", "box")  # b
 
 @dataclass(frozen=True, eq=False)
 class Bulk:
-    """What geoms are together. Those that overlap count fully: volumes and areas are sums."""
+    """Volume, area, box and curvature of several geoms: volumes and areas are sums, overlaps count twice."""
 
     volume: float  # volume [m³]
     area: float  # area of the surface [m²]
     low: Float[np.ndarray, " 3"]  # lower corner of the bounding box, in the body's frame [m]
     high: Float[np.ndarray, " 3"]  # upper corner
-    # mean curvature where something touches it, averaged over the area [1/m]: of a sphere 1/r, along the side of a cylinder or
-    # capsule 1/2r, of an ellipsoid that of the sphere of its volume, of flat faces and meshes 0
+    # mean curvature at points of contact, averaged over the area [1/m]: a sphere 1/r, the side of a cylinder or capsule 1/2r,
+    # an ellipsoid as the sphere of its volume, flat faces and meshes 0
     curvature: float
 
     @property
     def center(self) -> Float[np.ndarray, " 3"]:
-        """Centre of the bounding box [m]; the origin of what is unbounded."""
+        """Centre of the bounding box [m]; the origin if the box is unbounded."""
         return (self.low + self.high) / 2 if np.isfinite(self.high - self.low).all() else np.zeros(3)
 
 
@@ -57,7 +57,7 @@ def _of_primitive(geom: Geom) -> Bulk:
     a, b, c = geom.size.tolist()
     x, y, z = np.abs(geom.rotation).T
     match geom.shape:
-        case "plane":  # of its surface, most of which is of no interest, nothing counts
+        case "plane":  # its surface does not count
             return Bulk(inf, 0.0, np.full(3, -inf), np.full(3, inf), 0.0)
         case "sphere":
             volume, curvature, half = 4 / 3 * pi * a**3, 1 / a, np.full(3, a)

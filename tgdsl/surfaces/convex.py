@@ -1,4 +1,4 @@
-"""Convex solids: primitives and convex hulls, as a simulator collides them, and how deep points are inside.
+"""Convex solids: primitives and convex hulls, as a simulator collides them, and the depth of points inside.
 
 Shapes: `n` points, `k` half-spaces of a hull.
 """
@@ -12,9 +12,9 @@ from jaxtyping import Float
 
 from tgdsl.surfaces.surface import Surface
 
-CELLS = 8  # cells along each axis into which points are sorted, where they and the planes are many
+CELLS = 8  # cells along each axis into which points are sorted, if points and planes are many
 CHUNK = 1 << 21  # distances from half-spaces that are in memory at once
-SLACK = 1e-6  # widening of a bounding box [m]: what is just outside is a small distance away, not infinitely far
+SLACK = 1e-6  # widening of a bounding box [m]: points just outside have a small distance, not an infinite one
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class ConvexSolid:
         return depth
 
     def _from_planes(self, pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Return the distance from the nearest face's plane: that is the surface's for points inside."""
+        """Return the distance from the nearest face's plane, which is the surface's for points inside."""
         # Over a cell of points within r of its middle, a plane's distance changes by at most r: planes farther from the middle
         # than the nearest one by more than 2r are nearest to none of its points.
         if len(pos) * len(self.planes) <= CHUNK:
@@ -73,8 +73,7 @@ class ConvexSolid:
 def hull_planes(hull: Surface) -> Float[np.ndarray, "k 4"]:
     """Return outward unit normals and offsets of the planes that support a convex surface at its faces.
 
-    The offset is the farthest vertex', not the face's own: the plane of a face that is next to nothing may be turned anyhow,
-    and would cut the solid.
+    The offset is the farthest vertex', not the face's: the plane of a tiny face may have any direction and would cut the solid.
     """
     normals = np.unique(hull.face_normals[hull.face_areas > 0].round(12), axis=0)
     rows = max(1, CHUNK // len(hull.vertices))

@@ -31,12 +31,12 @@ class Geom:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names that a selector can find it by."""
+        """The names that a selector matches."""
         return tuple(name for name in (self.name, self.mesh) if name)
 
     @property
     def shown(self) -> str:
-        """How a message names it."""
+        """Its name in messages."""
         return f'geom "{self.name or self.mesh}"' if self.names else f"unnamed {self.shape} geom {self.id}"
 
 

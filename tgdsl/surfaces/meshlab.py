@@ -1,6 +1,6 @@
-"""A link's outer surface: its meshes cleaned, the components that lie inside others dropped; points spread over triangles.
+"""A link's outer surface: its meshes cleaned, without components inside others; points spread over triangles.
 
-Real meshes hold screws and magnets as components of their own, and disagree with themselves about what is outside.
+Real meshes hold screws and magnets as separate components, and their faces are wound inconsistently.
 
 The only file that imports pymeshlab (GPL-3), and only when a surface is cleaned or sampled: compiled
 modules run without it.
@@ -25,8 +25,8 @@ from tgdsl.surfaces.region import LENGTH_TOLERANCE
 from tgdsl.surfaces.surface import Surface, winding_number
 
 MAX_HOLE = 0.05
-"""A component is solid, so that points can be inside it, if the squared length of its border is at most this share of its
-area: a sphere with a hole of an eighth of its radius is, a bowl is not."""
+"""A component is solid, and can contain points, if the squared length of its border is at most this share of its area: a
+sphere with a hole of an eighth of its radius is solid, a bowl is not."""
 
 ROUNDING = 0.05
 """Fast winding numbers (Barill et al., SIGGRAPH 2018) that are this close to an integer are not computed exactly."""
@@ -34,7 +34,7 @@ ROUNDING = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Shell:
-    """A clean surface whose enclosed components are gone."""
+    """A clean surface without enclosed components."""
 
     surface: Surface  # its triangles; solid components are counter-clockwise seen from outside
     component: Int[np.ndarray, " f"]  # connected component of each face
@@ -108,13 +108,13 @@ def _clean(surface: Surface) -> Surface:
         used, faces = np.unique(faces, return_inverse=True)
         vertices = surface.vertices[used]
         meshes.add_mesh(pymeshlab.Mesh(vertices, faces.reshape(-1, 3)))
-        # Corners that files have several times, such as STL's, are off by the rounding of float32, far from the origin by more.
+        # Repeated corners in files such as STL differ by the rounding of float32, which grows with distance from the origin.
         weld = max(1e-6 * float(np.ptp(vertices, axis=0).max()), LENGTH_TOLERANCE)
         meshes.meshing_merge_close_vertices(threshold=pymeshlab.PureValue(weld))
         meshes.meshing_remove_duplicate_faces()
         meshes.meshing_remove_null_faces()
         if _disagrees(meshes.current_mesh().face_matrix()):
-            # Where more than two faces share an edge there is no coherent winding, and the file's is kept.
+            # If more than two faces share an edge there is no coherent winding, and the file's winding stays.
             with suppress(pymeshlab.PyMeshLabException):
                 meshes.meshing_re_orient_faces_coherently()
         mesh = meshes.current_mesh()
@@ -165,7 +165,7 @@ def _components(surface: Surface) -> Int[np.ndarray, " f"]:
 
 
 def _solid(surface: Surface, component: Int[np.ndarray, " f"]) -> Bool[np.ndarray, " component"]:
-    """Return which components are closed but for small holes."""
+    """Return whether each component is closed, except for small holes."""
     edges = np.sort(_edges(surface.faces), axis=1)
     _, first, num_faces = np.unique(edges, axis=0, return_index=True, return_counts=True)
     border = first[num_faces == 1]

@@ -1,11 +1,10 @@
-"""The surface that separates a mesh's inside from its outside: what distances to the mesh are measured to.
+"""The surface that separates a mesh's inside from its outside, to which distances are measured.
 
-Files have parts that are inside out, parts within or across others, faces that two parts share, and holes. The parts are wound
-outwards (`outward`), so that a point is inside where they wind around it (Jacobson, Kavan and Sorkine-Hornung, *Robust
-inside-outside segmentation using generalized winding numbers*, SIGGRAPH 2013; fast: Barill et al., SIGGRAPH 2018). Faces that
-cross or touch are cut there, and the pieces that have the inside on one side stay. Each loop of open edges gets a lid, a fan
-around the mean of its corners, which is such a face too. Sheets, which have the inside on no side, stay. Of faces that cover
-each other one stays.
+Files have parts that are inside out, parts within or across others, faces that two parts share, and holes. `outward` winds the
+parts outwards; a point is inside if they wind around it (Jacobson, Kavan and Sorkine-Hornung, *Robust inside-outside
+segmentation using generalized winding numbers*, SIGGRAPH 2013; fast: Barill et al., SIGGRAPH 2018). Faces that cross or touch
+are cut there; pieces with the inside on one side stay. Each loop of open edges gets a lid, a fan of faces around the mean of
+its corners. Sheets, with the inside on neither side, stay. Of faces that cover each other one stays.
 
 Shapes: `v` vertices, `f` and `g` faces, `n` points.
 """
@@ -23,11 +22,11 @@ from scipy.sparse.csgraph import connected_components
 from tgdsl.errors import BakeError
 from tgdsl.surfaces.surface import Surface, face_cross, hole_caps, merged, winding_number
 
-TOUCH = 1e-6  # distance at which faces touch, over the mesh's size: MuJoCo has its vertices in float32
-STEP = 1e-5  # distance in front of and behind a face at which one looks whether it is inside, over the mesh's size
-OPEN = "is not closed; what is inside is decided by its winding number"
-TWISTED = "has parts whose faces cannot be made to agree which side is out; they are as in its file"
-UNCUT = "has more faces that cross than are cut; those that are partly inside count as surface"
+TOUCH = 1e-6  # distance at which faces touch, over the mesh's size: MuJoCo's vertices are float32
+STEP = 1e-5  # distance in front of and behind a face at which points are tested for being inside, over the mesh's size
+OPEN = "is not closed; its winding number decides which points are inside"
+TWISTED = "has parts whose faces cannot be wound consistently; their winding is as in its file"
+UNCUT = "has too many crossing faces to cut; faces that are partly inside count as surface"
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +36,8 @@ class Outer:
     vertices: Float[np.ndarray, "v 3"]  # positions [m]
     # vertex indices, counter-clockwise seen from outside; sheets have each face twice, once from either side
     faces: Int[np.ndarray, "f 3"]
-    uncut: Int[np.ndarray, "g 3"]  # the mesh's faces of which there is something in `faces`, whole; on the same vertices
-    flaws: tuple[str, ...]  # what of the mesh its user should know, to be put after its name
+    uncut: Int[np.ndarray, "g 3"]  # the mesh's faces that are partly or wholly in `faces`, uncut; on the same vertices
+    flaws: tuple[str, ...]  # flaws of the mesh, as predicates for a warning
 
 
 def outer(surface: Surface) -> Outer:
@@ -54,7 +53,7 @@ def outer(surface: Surface) -> Outer:
         raise BakeError("a surface to bake needs a face with an area")
     parts = outward(vertices, faces, written)
     if len(parts.caps):
-        # Parts may share faces, but one that is there once too often is a part of its own.
+        # Parts may share faces, but a repeated face can become a separate part.
         first = _distinct(faces)
         parts = min(parts, outward(vertices, faces[first], written[first]), key=lambda candidate: len(candidate.caps))
     vertices, caps = parts.vertices, parts.caps[_has_area(parts.vertices[parts.caps])]
@@ -70,20 +69,20 @@ def outer(surface: Surface) -> Outer:
         # A face is within others only if its corners are too.
         pos = np.concatenate([pos, 0.02 * pos + 0.98 * corners], axis=1)
     sides = np.stack([pos + step[:, None], pos - step[:, None]])
-    before, behind = is_inside(vertices, closed, sides.reshape(-1, 3)).reshape(sides.shape[:3])
-    is_within = (before & behind).all(axis=1)
-    before, behind = before[:, 0], behind[:, 0]
-    is_sheet = ~before & ~behind
+    in_front, behind = is_inside(vertices, closed, sides.reshape(-1, 3)).reshape(sides.shape[:3])
+    is_within = (in_front & behind).all(axis=1)
+    in_front, behind = in_front[:, 0], behind[:, 0]
+    is_sheet = ~in_front & ~behind
     is_kept = ~is_within & ~_is_repeated(corners, normal, cells, crossed)
     flaws = {OPEN: len(caps) > 0, TWISTED: not parts.is_orientable, UNCUT: not crossed.is_complete}
-    is_turned = before & ~behind
+    is_turned = in_front & ~behind
     return _assembled(vertices, closed, cells, is_kept, is_turned, is_sheet, tuple(flaw for flaw in flaws if flaws[flaw]))
 
 
 def is_inside(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], pos: Float[np.ndarray, "n 3"]
 ) -> Bool[np.ndarray, " n"]:
-    """Return which points closed faces wind around, in either sense."""
+    """Return whether closed faces wind around each point, in either sense."""
     if not len(pos):
         return np.zeros(0, bool)
     winding = np.abs(np.atleast_1d(igl.fast_winding_number(vertices, faces, np.ascontiguousarray(pos))))
@@ -95,15 +94,15 @@ def is_inside(
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """What faces are cut into: whole faces first, then the cells of the others."""
+    """The cells of cut faces: whole faces first, then the cells of the others."""
 
     owner: Int[np.ndarray, " n"]  # the face of each
     middle: Float[np.ndarray, "n 3"]  # a point in it [m]
-    corners: list[Float[np.ndarray, "_ 3"]]  # of those that are no whole faces, corners [m]
+    corners: list[Float[np.ndarray, "_ 3"]]  # corners of the cells that are not whole faces [m]
 
 
 def _cells(corners: Float[np.ndarray, "f 3 3"], crossed: Crossings, tolerance: float) -> _Cells:
-    """Return the cells that faces are cut into."""
+    """Return the cells of cut faces."""
     order = np.argsort(crossed.cut, kind="stable")
     names, begin = np.unique(crossed.cut[order], return_index=True)
     polygons, owner = [], []
@@ -120,7 +119,7 @@ def _cells(corners: Float[np.ndarray, "f 3 3"], crossed: Crossings, tolerance: f
 def _is_repeated(
     corners: Float[np.ndarray, "f 3 3"], normal: Float[np.ndarray, "f 3"], cells: _Cells, crossed: Crossings
 ) -> Bool[np.ndarray, " n"]:
-    """Return which cells an earlier face of the same plane covers."""
+    """Return whether an earlier face in the same plane covers each cell."""
     order = np.argsort(cells.owner, kind="stable")
     begin, end = (np.searchsorted(cells.owner[order], crossed.covered, side) for side in ("left", "right"))
     pair = np.repeat(np.arange(len(crossed.covered)), end - begin)
@@ -141,7 +140,7 @@ def _assembled(
     is_sheet: np.ndarray,
     flaws: tuple[str, ...],
 ) -> Outer:
-    """Return the surface of the cells that are kept; faces all of whose cells are kept alike are whole."""
+    """Return the surface of the selected cells; a face stays whole if all its cells are treated equally."""
     kind = np.where(is_kept, 1 + is_turned + 2 * is_sheet, 0)
     lowest, highest = np.full(len(faces), 9), np.zeros(len(faces), np.int64)
     np.minimum.at(lowest, cells.owner, kind)
@@ -180,7 +179,7 @@ def _has_area(corners: Float[np.ndarray, "f 3 3"]) -> Bool[np.ndarray, " f"]:
 
 
 LEAF = 32  # faces whose boxes are compared with all near ones at once
-CHUNK = 1 << 18  # pairs that are looked at at once
+CHUNK = 1 << 18  # pairs that are tested at once
 MAX_PAIRS = 20_000_000  # largest number of pairs of faces whose boxes overlap
 MAX_SEGMENTS = 200_000  # largest number of segments along which faces are cut
 ROUNDING = 1e-3  # distance at which a cell's corner is on a line, over the tolerance
@@ -188,18 +187,18 @@ ROUNDING = 1e-3  # distance at which a cell's corner is on a line, over the tole
 
 @dataclass(frozen=True, eq=False)
 class Crossings:
-    """How the faces of a surface meet elsewhere than along their borders."""
+    """Where faces of a surface meet, apart from their borders."""
 
     cut: Int[np.ndarray, " s"]  # faces that others cross or touch
-    segments: Float[np.ndarray, "s 2 3"]  # along what each is cut [m]
-    # faces in a plane with earlier ones, which may cover them and along whose border they are cut
+    segments: Float[np.ndarray, "s 2 3"]  # segments along which they are cut [m]
+    # faces in the plane of earlier faces, which may cover them and along whose border they are cut
     covered: Int[np.ndarray, " n"]
-    cover: Int[np.ndarray, " n"]  # those earlier ones
-    is_complete: bool = True  # whether they were all looked at; if they are too many, none is there
+    cover: Int[np.ndarray, " n"]  # the earlier faces
+    is_complete: bool = True  # False if there are too many crossings; the arrays are then empty
 
 
 def crossings(corners: Float[np.ndarray, "f 3 3"], normal: Float[np.ndarray, "f 3"], tolerance: float) -> Crossings:
-    """Return how faces of these corners [m] and unit normals meet, if they do not meet too often.
+    """Return the crossings of faces with these corners [m] and unit normals, if there are not too many.
 
     Faces touch at a distance of `tolerance` [m].
     """
@@ -266,7 +265,7 @@ def _heights(base: np.ndarray, normal: np.ndarray, corners: np.ndarray, toleranc
 
 
 def _sections(corners: Float[np.ndarray, "n 3 3"], height: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return which triangles have a section with a plane that they are so high above, and its two ends [m]."""
+    """Return the triangles that a plane cuts, by their corners' heights above it, and the two ends of each section [m]."""
     after, onward = np.roll(height, -1, axis=1), np.roll(corners, -1, axis=1)
     crosses = height * after < 0
     part = np.divide(height, height - after, out=np.zeros_like(height), where=crosses)
@@ -279,9 +278,9 @@ def _sections(corners: Float[np.ndarray, "n 3 3"], height: Float[np.ndarray, "n 
 def cut_cells(
     triangle: Float[np.ndarray, "3 3"], segments: Float[np.ndarray, "s 2 3"], tolerance: float
 ) -> list[Float[np.ndarray, "_ 3"]]:
-    """Return the convex cells that the lines through segments in a triangle's plane cut it into, none of them met by a segment.
+    """Return the convex cells of a triangle, cut along the lines of segments in its plane until no segment crosses a cell.
 
-    Segments along the border of a cell do not count, nor what is nearer to it than the tolerance [m].
+    Segments along a cell's border, or nearer to it than the tolerance [m], do not count.
     """
     x = triangle[1] - triangle[0]
     x /= np.linalg.norm(x)
@@ -311,7 +310,7 @@ def cut_cells(
 def _clipped(
     segments: Float[np.ndarray, "s 2 d"], depth: Float[np.ndarray, "s 2 k"], tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return which segments pass through the interior of convex cells, and their ends there."""
+    """Return the segments that pass through the interior of convex cells, and their ends there."""
     slope = depth[:, 1] - depth[:, 0]
     at = np.divide(-depth[:, 0], slope, out=np.zeros_like(slope), where=slope != 0)
     begin = np.where(slope > 0, at, 0.0).max(axis=1).clip(0, 1)
@@ -328,7 +327,7 @@ def _next(cell: np.ndarray) -> np.ndarray:
 
 
 def _half(cell: Float[np.ndarray, "k 2"], side: Float[np.ndarray, " k"]) -> np.ndarray:
-    """Return the part of a convex cell on one side of a line, its corners being so far on that side of it."""
+    """Return the part of a convex cell on one side of a line; `side`: its corners' signed distances from the line."""
     after, onward = _next(side), _next(cell)
     crosses = side * after < 0
     part = np.divide(side, side - after, out=np.zeros_like(side), where=crosses)
@@ -338,7 +337,7 @@ def _half(cell: Float[np.ndarray, "k 2"], side: Float[np.ndarray, " k"]) -> np.n
 
 
 FLAT = 1e-9  # volume below which a part encloses none, over the cube of its size
-ENCLOSED = 0.9  # winding number of a part from which a point is within it: on its surface it is 1/2, at a notch of it more
+ENCLOSED = 0.9  # least winding number of a part for points within it: on its surface it is 1/2, at a notch more
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,14 +347,14 @@ class Parts:
     vertices: Float[np.ndarray, "w 3"]  # positions [m]
     faces: Int[np.ndarray, "f 3"]  # vertex indices, counter-clockwise seen from outside
     caps: Int[np.ndarray, "g 3"]  # triangles that close the parts' holes, wound like the faces
-    is_orientable: bool  # whether all neighbours could be made to agree. A part whose neighbours cannot is left as it was.
+    is_orientable: bool  # whether every part can be wound consistently; other parts keep their winding
 
 
 def outward(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], written: Int[np.ndarray, "f 3"]) -> Parts:
-    """Return a surface with its parts wound outwards: those within a larger part as it is wound, or opposite, as they were.
+    """Return a surface with its parts wound outwards; a part within a larger one keeps its winding relative to it.
 
-    So an inner shell that is wound against the shell around it remains a cavity, if both are inside out too. `faces` are of
-    distinct vertices, `written` the same faces as the file has them, where several vertices may be in one place.
+    An inner shell wound against the shell around it thus remains a cavity, even if both are inside out. `faces` refer to
+    distinct vertices; `written` are the file's faces, whose vertices may coincide.
     """
     part, is_turned, is_orientable = _coherent(vertices, faces, *_neighbours(vertices, faces, written))
     faces = np.where(is_turned[:, None], faces[:, ::-1], faces)
@@ -372,9 +371,9 @@ def outward(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], w
 def _coherent(
     vertices: np.ndarray, faces: np.ndarray, first: np.ndarray, second: np.ndarray, agrees: np.ndarray
 ) -> tuple[Int[np.ndarray, " f"], Bool[np.ndarray, " f"], bool]:
-    """Return each face's part, which faces are wound against most of their part's area, and whether that could be told."""
+    """Return each face's part, whether it is wound against most of the part's area, and whether all parts are orientable."""
     num = len(faces)
-    # Each face stands there twice, as it is and turned; what agrees is connected.
+    # Each face is two nodes, as it is and turned; nodes that agree are connected.
     start, end = np.tile(first, 2), np.where(np.tile(agrees, 2), np.tile(second, 2), np.tile(second + num, 2))
     start[len(first) :] += num
     end[len(first) :] = np.where(agrees, second + num, second)
@@ -405,7 +404,7 @@ def _neighbours(
     unpaired, which = unpaired[is_shared], which[is_shared]
     if len(unpaired):
         angle = _angles(vertices, np.sort(sides[unpaired], axis=1), np.roll(faces, 1, axis=1).T.reshape(-1)[unpaired], which)
-        # At one angle, what ends a wedge comes before what begins one.
+        # At equal angles, sides that end a wedge come before sides that begin one.
         order = np.lexsort((~is_forward[unpaired], angle, which))
         groups = np.split(unpaired[order], np.flatnonzero(np.diff(which[order])) + 1)
         pairs += [np.array(wedges) for group in groups if (wedges := _wedges(group.tolist(), is_forward))]
@@ -418,7 +417,7 @@ def _sides(faces: np.ndarray) -> Int[np.ndarray, "n 2"]:
 
 
 def _angles(vertices: np.ndarray, edges: np.ndarray, opposite: np.ndarray, which: np.ndarray) -> Float[np.ndarray, " n"]:
-    """Return the angle at which faces stand around their edges, from that of the first face of each edge [rad]."""
+    """Return the angles of faces around their edges, relative to the first face of each edge [rad]."""
     low, high = vertices[edges.T]
     along = (high - low) / np.linalg.norm(high - low, axis=1, keepdims=True)
     away = vertices[opposite] - low
@@ -445,7 +444,7 @@ def _wedges(sides: list[int], is_forward: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _inside_out(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, num: int) -> Bool[np.ndarray, " p"]:
-    """Return which closed parts are to be turned, by the sign of the volume of the largest part that each is within."""
+    """Return whether to turn each closed part, by the sign of the volume of the largest part that contains it."""
     first = np.unique(part, return_index=True)[1]
     corners = vertices[faces] - vertices[faces[first, 0]][part][:, None]
     volume = np.bincount(part, np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])), num) / 6.0

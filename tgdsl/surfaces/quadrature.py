@@ -1,9 +1,8 @@
-"""The outer surface of an object as triangles and as points with area weights: what integrals over it are summed from.
+"""The outer surface of an object as triangles, and as points with area weights for integrals over it.
 
-Geoms become triangles, bisected to a spacing; those of a primitive add up to its area in closed form. What lies inside
-another geom of the object is no surface, nor is a face that two geoms share from opposite sides; of one that they share from
-the same side the first counts. Triangles that another geom's surface crosses are bisected further. Nothing depends on a seed,
-but for points that are asked to be random.
+Geoms become triangles, bisected to a spacing; a primitive's triangles add up to its area in closed form. Surface inside another
+geom of the object does not count, nor does a face that two geoms share from opposite sides; of faces shared from the same side
+the first counts. Triangles that another geom's surface crosses are bisected further. Only random points depend on a seed.
 
 Shapes: `n` points, `f` triangles.
 """
@@ -26,9 +25,9 @@ from tgdsl.surfaces.geom import SurfaceGeom
 from tgdsl.surfaces.solid import Solid
 from tgdsl.surfaces.surface import face_areas, face_cross
 
-SECTIONS = 128  # least number of sides of what stands for a circle before its points are moved onto the true surface
-CUT = 16.0  # how many times finer than the spacing triangles are where another geom's surface cuts them
-STEP = 1e-7  # how far a point is moved out or in to see what is there [m]
+SECTIONS = 128  # least number of sides of the polygon for a circle, before its points are moved onto the true surface
+CUT = 16.0  # the spacing over the size of triangles that another geom's surface cuts
+STEP = 1e-7  # offset of points to either side of the surface, to test whether they are inside [m]
 
 Distance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -50,13 +49,13 @@ class Quadrature:
 class Pieces:
     """Small triangles of an outer surface."""
 
-    corners: Float[np.ndarray, "f 3 3"]  # their corners in the body's frame [m]; those of a primitive are chords of it
+    corners: Float[np.ndarray, "f 3 3"]  # their corners in the body's frame [m]; a primitive's triangles are chords
     pos: Float[np.ndarray, "f 3"]  # the point of the true surface at the middle of each [m]
     normal: Float[np.ndarray, "f 3"]  # unit normal out of the object there
     area: Float[np.ndarray, " f"]  # surface that each stands for [m²]
 
     def quadrature(self, spacing: float) -> Quadrature:
-        """Return one point per piece, or one for all those that share a cube of half the spacing [m]."""
+        """Return one point for all pieces in a cube of half the spacing [m]."""
         cube = np.floor((self.pos - self.pos.min(axis=0)) / (0.5 * spacing)).astype(np.int64)
         num = cube.max(axis=0) + 1
         _, which = np.unique(np.ravel_multi_index(tuple(cube.T), tuple(num)), return_inverse=True)
@@ -65,13 +64,13 @@ class Pieces:
         return Quadrature(pos / area[:, None], area)
 
     def random(self, count: int, seed: int) -> Float[np.ndarray, "n 3"]:
-        """Return points drawn alike from all of the surface [m]."""
+        """Return points drawn uniformly from the surface [m]."""
         return self._drawn(count, seed)[0]
 
     def random_by_side(self, count: int, seed: int) -> Float[np.ndarray, "n 3"]:
-        """Return the points of `random` in an order in which neighbours are mostly near: side by side, each along a curve.
+        """Return the points of `random`, ordered so that successive points are mostly near: side by side, each along a curve.
 
-        The six sides are what faces along one of the axes more than along the others; on each, points follow a Morton curve.
+        A side is the surface whose normals are closest to one of the six axis directions; its points follow a Morton curve.
         """
         pos, piece = self._drawn(count, seed)
         normal = self.normal[piece]
@@ -102,12 +101,12 @@ def outer_surface(geoms: Sequence[SurfaceGeom], spacing: float) -> Pieces:
 
 def extent(geoms: Sequence[SurfaceGeom]) -> Float[np.ndarray, "2 3"]:
     """Return the least and the largest coordinates of an object's geoms in the body's frame, planes left out [m]."""
-    found = [np.zeros((0, 3))]
+    corners = [np.zeros((0, 3))]
     for felt in (felt for felt in geoms if felt.shape != "plane"):
         geom = felt.geom
-        own = _triangles(felt.shape, geom.size, np.inf) if felt.surface is None else felt.surface.vertices
-        found.append(own.reshape(-1, 3) @ geom.rotation.T + geom.pos)
-    points = np.concatenate(found)
+        local = _triangles(felt.shape, geom.size, np.inf) if felt.surface is None else felt.surface.vertices
+        corners.append(local.reshape(-1, 3) @ geom.rotation.T + geom.pos)
+    points = np.concatenate(corners)
     return np.array([points.min(axis=0), points.max(axis=0)]) if len(points) else np.zeros((2, 3))
 
 
@@ -119,7 +118,7 @@ class _Geom:
     distance: Distance
     is_mesh: bool
     stretch: float
-    """Area of the true surface over that of the triangles."""
+    """Area of the true surface over the triangles' area."""
 
     @staticmethod
     def of(felt: SurfaceGeom, spacing: float) -> _Geom:
@@ -141,7 +140,7 @@ class _Geom:
         return _Geom(corners @ geom.rotation.T + geom.pos, distance, solid is not None, stretch)
 
     def on_surface(self, corners: Float[np.ndarray, "f 3 3"]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the points of the true surface at the middle of triangles, and the unit normals out of the solid there."""
+        """Return the points of the true surface at the triangles' centres, and the outward unit normals there."""
         middle = corners.mean(axis=1)
         if not self.is_mesh:
             value, gradient = self.distance(middle)
@@ -153,35 +152,35 @@ class _Geom:
 
 
 def _outer(i: int, solids: Sequence[_Geom], spacing: float) -> tuple[np.ndarray, ...]:
-    """Return corners, places, normals and areas of the pieces of one geom that are on the outside of all."""
-    own, others = solids[i], [(j < i, other) for j, other in enumerate(solids) if j != i]
-    corners, kept = own.corners, []
+    """Return corners, places, normals and areas of the pieces of one geom that are outside all other geoms."""
+    geom, rest = solids[i], [(j < i, other) for j, other in enumerate(solids) if j != i]
+    corners, pieces = geom.corners, []
     while len(corners):
-        pos, normal = own.on_surface(corners)
+        pos, normal = geom.on_surface(corners)
         side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
         is_out, is_cut = np.ones(len(corners), bool), np.zeros(len(corners), bool)
-        for is_earlier, other in others:
+        for is_earlier, other in rest:
             value = other.distance(pos)[0]
             is_out &= value > -side
             near = np.flatnonzero((np.abs(value) <= side) & (side <= spacing))
-            hidden = _hidden(own, other, is_earlier, corners[near])
+            hidden = _hidden(geom, other, is_earlier, corners[near])
             is_cut[near] |= hidden.any(axis=0) & ~hidden.all(axis=0) & (side[near] > spacing / CUT)
             is_out[near] &= ~hidden[0] | is_cut[near]
         is_split = is_out & ((side > spacing) | is_cut)
         is_done = is_out & ~is_split
         done = corners[is_done]
-        kept.append((done, pos[is_done], normal[is_done], own.stretch * face_areas(done)))
+        pieces.append((done, pos[is_done], normal[is_done], geom.stretch * face_areas(done)))
         corners = _bisected(corners[is_split])
-    return tuple(np.concatenate(part) for part in zip(*kept, strict=True))
+    return tuple(np.concatenate(part) for part in zip(*pieces, strict=True))
 
 
-def _hidden(own: _Geom, other: _Geom, is_earlier: bool, corners: Float[np.ndarray, "f 3 3"]) -> Bool[np.ndarray, "4 f"]:
-    """Return whether another geom hides the surface at the middle of triangles and just within their corners."""
+def _hidden(geom: _Geom, other: _Geom, is_earlier: bool, corners: Float[np.ndarray, "f 3 3"]) -> Bool[np.ndarray, "4 f"]:
+    """Return whether another geom hides the surface at the triangles' centres and just within their corners."""
     middle = corners.mean(axis=1)
     results = []
     for k in range(4):
         pulled = corners if k == 0 else corners + 0.98 * (corners[:, k - 1] - middle)[:, None]
-        pos, normal = own.on_surface(pulled)
+        pos, normal = geom.on_surface(pulled)
         hidden = other.distance(pos + STEP * normal)[0] < 0
         results.append(hidden | (other.distance(pos - STEP * normal)[0] < 0) if is_earlier else hidden)
     return np.array(results)
@@ -197,7 +196,7 @@ def _bisected(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "g 3 3"]
 
 
 def _morton(pos: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-    """Return the places of points on a Morton curve through 1024³ cubes: the bits of their three indices, interleaved."""
+    """Return the points' positions on a Morton curve through 1024³ cubes: the interleaved bits of their three indices."""
     low = pos.min(axis=0)
     size = max(float((pos - low).max()), 1e-30)
     cube = (1023 / size * (pos - low)).astype(np.int64)
@@ -212,7 +211,7 @@ def _triangles(shape: str, size: Float[np.ndarray, " 3"], spacing: float) -> Flo
     radius = float(size.max() if shape == "ellipsoid" else size[0])
     half = float(size[1]) if shape in ("capsule", "cylinder") else 0.0
     sections = max(SECTIONS, int(np.ceil(2 * np.pi * radius / spacing)))
-    # The chord polygon has the circle's length, so that what stands for the surface has its area.
+    # The chord polygon has the circle's length, so that the triangles have the surface's area.
     swell = (np.pi / sections) / np.sin(np.pi / sections)
     wall = np.linspace(-half, half, max(1, int(np.ceil(2 * half / spacing))) + 1)
     if shape == "cylinder":

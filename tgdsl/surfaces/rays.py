@@ -23,7 +23,7 @@ from tgdsl.surfaces.region import LENGTH_TOLERANCE, Region
 from tgdsl.surfaces.surface import Surface
 
 NEAR_PARALLEL = 0.7
-"""An axis with a larger |cosine| to a direction is not used to orient what is perpendicular to that direction."""
+"""An axis with a larger |cosine| to a direction is not used to orient vectors perpendicular to that direction."""
 EDGE_ON = 1e-6  # faces with a smaller |cosine| between normal and rays are left out: their neighbours cover the same rays
 ROUNDING = 1e-9
 """Widening of faces, relative to the largest coordinate, so that no ray slips between two faces that share an edge."""
@@ -50,7 +50,7 @@ class OrthographicView:
     ) -> OrthographicView:
         """Return the view of a surface along `axes[2]`, without faces that are edge-on or have no area.
 
-        Faces that are one-sided are left out where they look along the rays, as those of solids are hidden then.
+        One-sided faces that look along the rays are left out: on solids they are hidden.
         """
         cosine = surface.face_normals @ axes[2]
         face_id = np.flatnonzero((np.abs(cosine) > EDGE_ON) & ((cosine < 0) | np.logical_not(is_one_sided)))
@@ -64,7 +64,7 @@ class OrthographicView:
 
 
 def sphere_directions(count: int) -> Float[np.ndarray, "direction 3"]:
-    """Return a Fibonacci lattice of unit vectors, in an order that meets every side early."""
+    """Return a Fibonacci lattice of unit vectors, ordered so that every side is visited early."""
     place = 37 * np.arange(count) % count
     height = 1.0 - (2.0 * place + 1.0) / count
     turn = np.pi * (3.0 - np.sqrt(5.0)) * place
@@ -186,9 +186,9 @@ def _runs(sorted_ids: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " run"], I
 def visible_rectangle(view: OrthographicView, region: Region) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]] | None:
     """Return the bounding rectangle, in (u, v), of all first hits in the region; None if there is no such hit.
 
-    Without a region it is the rectangle of the projected corners. With one it is exact wherever an extreme point of the
-    region on some face is visible (a box's side, a sphere's rim, a corner of the mesh); where what hides or covers it cuts
-    the region it is known to within one raster cell, 1/256 of the region's longer side.
+    Without a region it is the rectangle of the projected corners. With a region it is exact if an extreme point of the region
+    on some face is visible (a box's side, a sphere's rim, a corner of the mesh); where another surface hides or covers part of
+    the region, it is accurate to one raster cell, 1/256 of the region's longer side.
     """
     if region.is_everything:
         corners = view.corners[:, :, :2].reshape(-1, 2)
@@ -198,14 +198,14 @@ def visible_rectangle(view: OrthographicView, region: Region) -> tuple[Float[np.
     if not len(extremes):
         return None
     uv = extremes @ view.axes[:2].T
-    found = _raster_hits(view, region, uv.min(axis=0), uv.max(axis=0))
-    low, high = (found.min(axis=0), found.max(axis=0)) if len(found) else (np.full(2, np.inf), np.full(2, -np.inf))
+    hits = _raster_hits(view, region, uv.min(axis=0), uv.max(axis=0))
+    low, high = (hits.min(axis=0), hits.max(axis=0)) if len(hits) else (np.full(2, np.inf), np.full(2, -np.inf))
     is_outside = ((uv < low) | (uv > high)).any(axis=1) & region.has_points(extremes)
-    # A corner can be visible although its face is hidden, so look a little way inside the face.
-    looked_at = extremes[is_outside] + 1e-3 * (inner[is_outside] - extremes[is_outside])
-    uvt = looked_at @ view.axes.T
+    # A corner can be visible although its face is hidden: test a point slightly inside the face.
+    tested = extremes[is_outside] + 1e-3 * (inner[is_outside] - extremes[is_outside])
+    uvt = tested @ view.axes.T
     is_seen = first_hits(view, uvt[:, :2]).depth >= uvt[:, 2] - view.rounding - 3 * LENGTH_TOLERANCE
-    seen = np.concatenate([found, uv[is_outside][is_seen]])
+    seen = np.concatenate([hits, uv[is_outside][is_seen]])
     return (seen.min(axis=0), seen.max(axis=0)) if len(seen) else None
 
 

@@ -1,6 +1,6 @@
-"""Part of a surface: where its faces look, boxes, spheres and geoms, and where such a part reaches farthest.
+"""Part of a surface: by its faces' directions, boxes, spheres and geoms; and the extreme points of such a part.
 
-Shapes: `n` faces or points, `m` corners of polygons or points on them, `k` what is left of `n`.
+Shapes: `n` faces or points, `m` corners of polygons or points on them, `k` remaining ones of `n`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tgdsl.fields.models import Selection
 from tgdsl.fields.regions import Facing, InBox, InSphere, OnGeoms, RegionPart
 from tgdsl.surfaces.surface import Surface, face_areas
 
-LENGTH_TOLERANCE = 1e-6  # points this close to a region's border belong to it [m]: float32 mesh files round by about as much
+LENGTH_TOLERANCE = 1e-6  # points this close to a region's border belong to it [m]: about the rounding of float32 mesh files
 ANGLE_TOLERANCE = 1e-4
 """The same for the normals of faces a millimetre wide [rad]: a chamfer of 45° is within 45°, however its corners round."""
 Covered = Callable[[Float[np.ndarray, "n 3"]], Bool[np.ndarray, " n"]]  # returns which points of the body frame [m] are covered
@@ -32,11 +32,11 @@ class Region:
     facings: tuple[tuple[Float[np.ndarray, " 3"], float], ...]
     boxes: tuple[tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]], ...]  # lower and upper corner [m]
     spheres: tuple[tuple[Float[np.ndarray, " 3"], float], ...]  # centre and radius [m]
-    is_covered: Covered | None = None  # returns which points are no part of it, as other solids cover them; None: none are
+    is_covered: Covered | None = None  # returns which points are left out because other solids cover them; None: none
 
     @staticmethod
     def of(surface: Surface, parts: Sequence[RegionPart], is_covered: Covered | None = None) -> Region:
-        """Return what a user wrote, on a link's surface, without what other solids cover.
+        """Return the region that a user specified on a link's surface, without the parts that other solids cover.
 
         Raises:
             SampleError: If the link has no such geom.
@@ -44,8 +44,8 @@ class Region:
         is_geom = None
         for part in parts:
             if isinstance(part, OnGeoms):
-                chosen = _chosen_geoms(surface, part.geoms)
-                is_geom = chosen if is_geom is None else is_geom & chosen
+                mask = _geom_mask(surface, part.geoms)
+                is_geom = mask if is_geom is None else is_geom & mask
         return Region(
             is_geom=is_geom,
             facings=tuple((unit(np.array(part.facing)), part.within) for part in parts if isinstance(part, Facing)),
@@ -60,7 +60,7 @@ class Region:
         return self.is_geom is None and self.is_covered is None and not (self.facings or self.boxes or self.spheres)
 
     def has_faces(self, normals: Float[np.ndarray, "n 3"], geom: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-        """Return which faces may belong, by their outward unit normals (body frame) and geoms."""
+        """Return which faces may belong to it, by their outward unit normals (body frame) and geoms."""
         is_in = np.ones(len(normals), dtype=bool) if self.is_geom is None else self.is_geom[geom]
         for direction, within in self.facings:
             sine = np.linalg.norm(np.cross(normals, direction), axis=1)
@@ -68,7 +68,7 @@ class Region:
         return is_in
 
     def has_points(self, pos: Float[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
-        """Return which points of such faces belong, by position (body frame) [m]."""
+        """Return which points of such faces belong to it, by position (body frame) [m]."""
         is_in = self.is_within(pos)
         if self.is_covered is not None:
             is_in[is_in] = ~self.is_covered(pos[is_in])
@@ -84,7 +84,7 @@ class Region:
         return is_in
 
     def clipped(self, corners: Float[np.ndarray, "n 3 3"]) -> tuple[Float[np.ndarray, "k m 3"], Int[np.ndarray, " k"]]:
-        """Return what boxes, and the boxes around spheres, leave of faces: convex polygons and the face of each.
+        """Return faces clipped to the boxes, and to the boxes around spheres: convex polygons and the face of each.
 
         Polygons with fewer than `m` corners repeat their last.
         """
@@ -99,9 +99,9 @@ class Region:
     def extremes(
         self, corners: Float[np.ndarray, "n 3 3"], normals: Float[np.ndarray, "n 3"], axes: Float[np.ndarray, "2 3"]
     ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
-        """Return the points where the part of a face in the region, covered or not, can reach farthest along some axes.
+        """Return candidates for the extreme points of each face's part in the region, covered or not, along some axes.
 
-        With each comes a point within its face. Normals and axes are unit vectors, all in the body frame [m].
+        Each comes with a point within its face. Normals and axes are unit vectors, all in the body frame [m].
         """
         polygons, owner = self.clipped(corners)
         candidates = [polygons]
@@ -117,7 +117,7 @@ class Region:
 def _clipped(
     polygons: Float[np.ndarray, "n m 3"], axis: int, side: float, bound: float
 ) -> tuple[Float[np.ndarray, "k m+1 3"], Int[np.ndarray, " k"]]:
-    """Return convex polygons cut at a plane, and which are left; a polygon with few corners repeats its last."""
+    """Return convex polygons cut at a plane, and the rows that remain; a polygon with few corners repeats its last."""
     height = side * (polygons[..., axis] - bound)
     height = np.where(np.abs(height) <= LENGTH_TOLERANCE, 0.0, height)
     polygons = polygons.copy()
@@ -138,7 +138,7 @@ def _clipped(
 
 
 def _rim(polygons: Float[np.ndarray, "n m 3"], center: Float[np.ndarray, " 3"], radius: float) -> Float[np.ndarray, "n k 3"]:
-    """Return where the edges of polygons pass through a sphere; NaN where they do not."""
+    """Return the intersections of polygons' edges with a sphere; NaN where there is none."""
     start, along = polygons - center, np.roll(polygons, -1, axis=1) - polygons
     a, b = (along**2).sum(-1), (start * along).sum(-1)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -155,7 +155,7 @@ def _disc(
     center: Float[np.ndarray, " 3"],
     radius: float,
 ) -> Float[np.ndarray, "n 4 3"]:
-    """Return where the disc that a sphere cuts out of a face's plane reaches farthest along ±axes; NaN off the face."""
+    """Return the extreme points along ±axes of the disc that a sphere cuts from a face's plane; NaN off the face."""
     height = ((corners[:, 0] - center) * normals).sum(-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         disc_radius = np.sqrt(radius**2 - height**2)
@@ -191,8 +191,8 @@ def clip(surface: Surface, parts: Sequence[RegionPart]) -> Surface:
     return Surface(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), geom, surface.geoms)
 
 
-def _chosen_geoms(surface: Surface, selection: Selection) -> Bool[np.ndarray, " geom"]:
-    """Return which geoms a selection takes, by any of their names."""
+def _geom_mask(surface: Surface, selection: Selection) -> Bool[np.ndarray, " geom"]:
+    """Return the mask of a selection's geoms, by any of their names."""
 
     def matching(patterns: tuple[str, ...]) -> Bool[np.ndarray, " geom"]:
         return np.array(
@@ -202,14 +202,14 @@ def _chosen_geoms(surface: Surface, selection: Selection) -> Bool[np.ndarray, " 
 
     included = matching(selection.include)
     if not included.any():
-        wanted = ", ".join(f'"{pattern}"' for pattern in selection.include)
+        patterns_text = ", ".join(f'"{pattern}"' for pattern in selection.include)
         names = [name for names in surface.geoms for name in names]
         hint = did_you_mean(selection.include[0], names, "named geoms on this link")
-        raise SampleError(f"no geom or mesh of this link matches {wanted}", hint)
-    chosen = included & ~matching(selection.exclude)
-    if not chosen.any():
+        raise SampleError(f"no geom or mesh of this link matches {patterns_text}", hint)
+    mask = included & ~matching(selection.exclude)
+    if not mask.any():
         raise SampleError("`exclude` leaves none of the geoms that `include` takes", "exclude less")
-    return chosen
+    return mask
 
 
 def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:

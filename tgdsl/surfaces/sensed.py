@@ -1,6 +1,6 @@
-"""An object that can be sensed: its geoms, those of each of its variants, and how distances to them are found.
+"""An object that can be sensed: the geoms of each of its variants, and the options of distances to them.
 
-It is NumPy, and knows neither MuJoCo nor the document.
+Plain NumPy, without MuJoCo or the document.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from tgdsl.surfaces.geom import SurfaceGeom
 
 @dataclass(frozen=True)
 class DistanceOptions:
-    """How the distance to triangles is found."""
+    """Options of distances to triangles."""
 
-    # `sdf` from a grid that is computed beforehand, `raycast` by the triangles themselves
+    # `sdf`: from a precomputed grid; `raycast`: from the triangles
     query: Literal["sdf", "raycast"] = "sdf"
     tolerance: float = 5e-5  # largest error of a grid [m]
     max_bytes: int = 64 * 2**20  # largest size of a grid [bytes]
@@ -27,17 +27,17 @@ class DistanceOptions:
 
 @dataclass(frozen=True, eq=False)
 class ObjectHeat:
-    """What the flow of heat needs to know of an object.
+    """Thermal data of an object.
 
-    Shapes: `variant` variants of the object; a single one if it is the same everywhere.
+    Shapes: `variant` variants of the object; a single one if all environments have the same.
     """
 
-    # when an episode begins [°C]; None: that of the surroundings. If it is per environment, what the simulator begins with.
+    # temperature at the start of an episode [°C]; None: ambient. If it is per environment, the simulator's initial value.
     temperature: float | None
     is_per_env: bool  # whether the temperature is part of the state: its field `object_temperature`
-    # what it may be made of; if there are several, the state's field `object_material` says which
+    # its possible materials; with several, the state's field `object_material` selects one
     materials: tuple[Material, ...]
-    cells: tuple[int, int, int] | None  # numbers of cells of its grid along x, y, z; None: it has one temperature
+    cells: tuple[int, int, int] | None  # numbers of cells of its grid along x, y, z; None: one temperature
     volume: Float[np.ndarray, " variant"]  # volume of its geoms [m³]
     area: Float[np.ndarray, " variant"]  # area of their surface [m²]
     box_center: Float[np.ndarray, "variant 3"]  # centre of their bounding box in the frame of its body [m]
@@ -51,11 +51,10 @@ class SensedObject:
 
     name: str  # its name in the document
     body: str  # its body
-    # the geoms of each of its variants; of a single one if it is the same everywhere
+    # the geoms of each of its variants; a single one if all environments have the same
     variants: tuple[tuple[SurfaceGeom, ...], ...]
     is_sized: bool  # whether the size of its geom is part of the state
-    bodies: tuple[int, ...]  # its body and those that are welded to it, by their indices in the scene
+    bodies: tuple[int, ...]  # its body and the bodies welded to it, by their indices in the scene
     touched: frozenset[int]  # geoms of the scene that the solver's contacts with it act on
-    distance: DistanceOptions  # how the distance to its triangles is found
-    # what the flow of heat needs to know of it; None if the document does not say what it is made of
-    heat: ObjectHeat | None = None
+    distance: DistanceOptions  # options of the distance to its triangles
+    heat: ObjectHeat | None = None  # its thermal data; None if the document gives it no material

@@ -20,12 +20,12 @@ from tgdsl.surfaces.outer import is_inside, outer
 from tgdsl.surfaces.surface import Surface, face_cross
 
 SHARP = np.deg2rad(30.0)  # angle between the normals of two faces from which their edge is sharp [rad]
-CHUNK = 1 << 18  # points that are asked for at once
+CHUNK = 1 << 18  # points per query
 
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """A regular grid of nodes around a solid: its bounding box, a margin, and one cell more for the stencil."""
+    """A regular grid of nodes around a solid: its bounding box, a margin, and one more cell for the stencil."""
 
     origin: Float[np.ndarray, " 3"]
     cell: float
@@ -49,7 +49,7 @@ class Lattice:
         return self.origin + self.cell * np.stack(np.unravel_index(nodes, self.shape), axis=1)
 
     def nodes_around(self, pos: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " m"]:
-        """Return the nodes that interpolating at some points takes, as sorted flat indices."""
+        """Return the nodes needed to interpolate at some points, as sorted flat indices."""
         lower = np.floor((pos - self.origin) / self.cell).astype(int)
         stencil = np.stack(np.meshgrid(*[np.arange(-1, 3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         return np.unique(np.ravel_multi_index(tuple((lower[:, None] + stencil).reshape(-1, 3).T), self.shape, mode="clip"))
@@ -71,7 +71,7 @@ class Solid:
         self._tree = _tree(*self._faces)
 
     def is_inside(self, pos: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Return which points are inside."""
+        """Return whether each point is inside."""
         return is_inside(*self._faces, pos)
 
     def distance(self, pos: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
@@ -86,8 +86,8 @@ class Solid:
     def node_distance(self, lattice: Lattice) -> Float[np.ndarray, "x y z"]:
         """Return the signed distance at all nodes [m].
 
-        Between two neighbours that are both farther from the surface than half a cell there is none: such nodes that hang
-        together are on one side, and the winding number of one of them tells which.
+        There is no surface between two neighbours that are both farther than half a cell from it: connected nodes of this kind
+        are on one side, which the winding number of one of them decides.
         """
         length = np.empty(math.prod(lattice.shape))
         for start in range(0, len(length), CHUNK):

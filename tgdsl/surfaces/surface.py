@@ -97,7 +97,7 @@ def winding_number(
 
 
 def merged(surface: Surface) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"], Int[np.ndarray, " f"]]:
-    """Return a surface's distinct vertices [m], the faces that have three of them, and which of its faces these are."""
+    """Return a surface's distinct vertices [m], the faces with three distinct ones, and these faces' indices."""
     vertices, same = np.unique(np.asarray(surface.vertices, float) + 0.0, axis=0, return_inverse=True)
     faces = same.reshape(-1)[np.asarray(surface.faces, np.int64)]
     face = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
@@ -109,8 +109,8 @@ def hole_caps(
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
     """Return the vertices with a centre for each boundary loop, and the triangle fans that close the loops.
 
-    An edge is open where its faces do not run along it as often one way as the other. What is open is a boundary and has
-    none itself, so every walk along open edges comes back, whatever the mesh.
+    An edge is open unless its faces run along it equally often in both senses. Open edges form a boundary, which has no
+    boundary itself: every walk along them returns to its start, for any mesh.
     """
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     pairs, which = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
