@@ -65,7 +65,7 @@ def test_a_stack_may_be_a_view_of_the_memory(build):
 
 
 def test_only_a_stack_can_be_a_view(build):
-    with pytest.raises(SpecError, match=r"`view` is used by `reduce: stack` alone, expected it to be left out"):
+    with pytest.raises(SpecError, match=r"`view` has no effect without `reduce: stack`, expected it to be left out"):
         build(s={"history": {"length": 5, "reduce": "mean", "view": True}})
 
 

@@ -18,18 +18,18 @@ _PERCENT = re.compile(r"\s*+([0-9]++\.?[0-9]*+|\.[0-9]++)([eE][-+]?[0-9]++)?\s*+
 
 
 class Bound(NamedTuple):
-    """What an error may amount to."""
+    """Largest accepted error."""
 
-    value: float  # it, in the unit
-    unit: str  # the unit of the channels that it is of, `N·m`; empty: a fraction of the largest change
-    text: str  # as a document has it
+    value: float  # the bound, in the unit
+    unit: str  # unit of its channels, `N·m`; empty: a fraction of the largest change
+    text: str  # the bound as written in a document
 
 
 @dataclass(frozen=True)
 class Accuracy:
     """Bounds of a reading's errors."""
 
-    bounds: tuple[tuple[str, Bound], ...]  # the bound of each quantity, `force` of `force_x`; under the empty name that of all
+    bounds: tuple[tuple[str, Bound], ...]  # the bound of each quantity, `force` for `force_x`; the empty name: of all
 
     def of(self, quantity: str) -> Bound | None:
         """Return the bound of a quantity."""

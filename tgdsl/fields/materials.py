@@ -36,9 +36,9 @@ from tgdsl.fields.models import TEXT_OR_OTHER, Pressure, Quantity, SpecModel, Us
 
 @dataclass(frozen=True)
 class Material:
-    """What a body is made of."""
+    """The material of a body: thermal and elastic properties."""
 
-    name: str  # its name; of one that a document gives by numbers, what that is based on
+    name: str  # its name; for a material by numbers, the name of the one that it is based on
     conductivity: Annotated[float, Usual("conductivity", low=0.01, high=2500.0)]  # thermal conductivity k [W/(m·K)]
     density: Annotated[float, Usual("mass_density", low=5.0, high=25000.0)]  # ρ [kg/m³]
     specific_heat: Annotated[float, Usual("specific_heat", low=100.0, high=10000.0)]  # specific heat capacity c [J/(kg·K)]
@@ -128,12 +128,12 @@ _Name = Annotated[
 
 
 class OwnMaterial(SpecModel):
-    """A material by numbers: those of a known one with changes, or all of heat's."""
+    """A material by numbers: a known material with changes, or all numbers that heat flow needs."""
 
     model_config = ConfigDict(json_schema_extra={"anyOf": [{"required": ["like"]}, {"required": [*THERMAL]}]})
 
     like: _Name | None = None
-    """Name of a material that it is like, but for what is given."""
+    """Name of the material that supplies all properties not given here."""
     conductivity: Annotated[float | None, Quantity("conductivity", gt=0.0)] = None
     """Thermal conductivity [W/(m·K)]."""
     density: Annotated[float | None, Quantity("mass_density", gt=0.0)] = None

@@ -60,7 +60,7 @@ PATTERN = r"^\s*[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?\s*(%s)?\s*$"
 class Quantity:
     """Marks a float that may also be written with a unit, bounded in SI units."""
 
-    dimension: str | units.Dimension  # a key of `units.UNITS`, or a `units.Dimension` of one's own
+    dimension: str | units.Dimension  # a key of `units.UNITS`, or your own `units.Dimension`
     ge: float | None = None  # least value
     gt: float | None = None  # bound that the value must exceed
     le: float | None = None  # largest value
@@ -115,20 +115,20 @@ class RangeOf(Quantity):
 
 @dataclass(frozen=True)
 class Usual:
-    """Marks a field whose value was most likely meant in another unit beyond these bounds: a warning then says so."""
+    """Marks a field whose value, beyond these bounds, was most likely meant in another unit, and triggers a warning."""
 
-    dimension: str | units.Dimension  # a key of `units.UNITS`, or a `units.Dimension` of one's own
+    dimension: str | units.Dimension  # a key of `units.UNITS`, or your own `units.Dimension`
     low: float = 0.0  # least usual magnitude, in SI units; 0 is usual too
     high: float = math.inf  # largest usual magnitude
 
     def doubt(self, value: float) -> tuple[str, str] | None:
-        """Return what is unusual about a value, and a hint; None if nothing is."""
+        """Return the reason why a value is unusual, and a hint; None for a usual value."""
         return units.doubt(value, self.dimension, self.low, self.high)
 
 
 Text = Annotated[str, Tag("text")]
 TEXT_OR_OTHER = Discriminator(lambda value: "text" if isinstance(value, str) else "other")
-"""Tells `Text` from a type tagged "other" by what is found, so that errors speak of one of them only."""
+"""Distinguishes `Text` from a type tagged "other" by the value's type, so that errors mention only one of them."""
 
 Length = Annotated[float, Quantity("length")]
 PositiveLength = Annotated[float, Quantity("length", gt=0.0)]
@@ -157,7 +157,7 @@ class Selection(SpecModel):
     """Names to take: shell wildcards or group names; what `exclude` matches is left out."""
 
     include: Annotated[tuple[str, ...], Field(min_length=1)]
-    """Names, shell wildcards (`*_link2`) or group names, of which at least one must match."""
+    """Names, shell wildcards (`*_link2`) or group names; at least one must match."""
     exclude: tuple[str, ...] = ()
     """Names, wildcards or groups to leave out again."""
 
@@ -196,20 +196,20 @@ Selector = Annotated[
 
 
 class HistorySpec(SpecModel):
-    """What is read of the last calls."""
+    """A window over the last calls' readings."""
 
     length: Annotated[StrictInt, Field(ge=1), Usual("number", high=1000.0)]
-    """Calls that count, this one included; before there are so many since a reset, the first one stands for the missing."""
+    """Number of calls in the window, this one included; after a reset the first call fills the window."""
     reduce: Literal["stack", "last", "median", "mean"] = "stack"
-    """`stack`: all of them, oldest first, as a further dimension; or one reading made of them."""
+    """`stack`: all of them, oldest first, along a further dimension; otherwise one reading computed from them."""
     view: StrictBool = False
-    """Whether a stack is handed out as a view of the module's own memory, which the next call overwrites and which
-    carries no gradient; default: a copy."""
+    """Whether a stack is returned as a view of the module's memory, which the next call overwrites and which carries no
+    gradient; default: a copy."""
 
     @model_validator(mode="after")
     def _is_used(self) -> HistorySpec:
         if self.view and self.reduce != "stack":
-            raise ValueError("`view` is used by `reduce: stack` alone, expected it to be left out")
+            raise ValueError("`view` has no effect without `reduce: stack`, expected it to be left out")
         return self
 
 

@@ -30,15 +30,15 @@ UNITS: dict[str, dict[str, float]] = {
 }
 """Factor to SI of every unit, by dimension; the first of a dimension is the unit inside tgdsl: SI, but of temperatures degC."""
 ZEROS: dict[str, float] = {"K": -273.15}
-"""Where the scale of a unit begins, in the first unit of its dimension; all others begin at 0."""
+"""Zero of a unit's scale, in the first unit of its dimension; it is 0 for all other units."""
 
 
 @dataclass(frozen=True, eq=False)
 class Dimension:
-    """A dimension that `UNITS` lacks, for kinds of sensors and tasks of one's own."""
+    """A dimension that `UNITS` lacks, for your own kinds of sensors and tasks."""
 
-    name: str  # what it is called in messages
-    units: Mapping[str, float]  # factor to SI of each of its units; the first is the one inside tgdsl, with a factor of 1
+    name: str  # its name in messages
+    units: Mapping[str, float]  # factor to SI of each of its units; the first is tgdsl's internal unit, with a factor of 1
 
     def __post_init__(self) -> None:
         """Raise `ValueError` if the first unit is not the one inside, or a unit cannot be written behind a number."""
@@ -50,15 +50,15 @@ class Dimension:
 
 
 def units_of(dimension: str | Dimension) -> Mapping[str, float]:
-    """Return the factor to SI of every unit of a dimension: a key of `UNITS`, or one's own."""
+    """Return the factor to SI of every unit of a dimension: a key of `UNITS`, or your own `Dimension`."""
     return dimension.units if isinstance(dimension, Dimension) else UNITS[dimension]
 
 
 _QUANTITY = re.compile(r"\s*+([-+]?(?:[0-9]++\.?[0-9]*+|\.[0-9]++)(?:[eE][-+]?[0-9]++)?)\s*+([A-Za-zµ/][\w*/µ()]*+)?\s*+\Z")
-"""A number and a unit; possessive, so that nothing is read twice and a long text takes no long time."""
+"""A number and a unit; possessive quantifiers avoid backtracking on long texts."""
 
 _SPELLINGS = str.maketrans({"^": "", "²": "2", "³": "3", "°": "deg", "·": "*", "⋅": "*", "×": "*", "μ": "µ"})
-"""How units may be spelled elsewhere, and how they are here."""
+"""Other spellings of units, and tgdsl's."""
 
 
 def parse(value: object, dimension: str | Dimension) -> float:
@@ -95,19 +95,19 @@ def parse(value: object, dimension: str | Dimension) -> float:
 
 
 def unit_of(value: str) -> str:
-    """Return the unit that stands behind a number in a text; empty: there is none, or the text is no quantity."""
+    """Return the unit after a number in a text; empty if there is none, or the text is no quantity."""
     match = _QUANTITY.match(value)
     return (match[2] or "") if match else ""
 
 
 def dimension_of(value: str, dimensions: Sequence[str]) -> str | None:
-    """Return which of some dimensions the unit of a text such as "4 mm" is of; None: of none of them."""
+    """Return the dimension, among some, of the unit in a text such as "4 mm"; None if it has none of them."""
     unit = unit_of(value.translate(_SPELLINGS))
     return next((dimension for dimension in dimensions if unit in UNITS[dimension]), None)
 
 
 def _without_unit(number: float, unit: str) -> str:
-    """Return what is expected where a plain number is, if one with a unit was found: in SI, if the unit is known."""
+    """Return the expected plain number for a number with a unit: in SI, if the unit is known."""
     factors = next((factors for factors in UNITS.values() if unit in factors), None)
     if factors is None:
         return "expected a plain number"
@@ -115,7 +115,7 @@ def _without_unit(number: float, unit: str) -> str:
 
 
 def doubt(value: float, dimension: str | Dimension, low: float, high: float) -> tuple[str, str] | None:
-    """Return why a quantity [SI] was most likely meant in another unit, and in which; None of usual magnitudes, and of 0."""
+    """Return why a quantity [SI] was most likely meant in another unit, and which; None for usual magnitudes and 0."""
     if value == 0 or low <= abs(value) <= high:
         return None
     factors = units_of(dimension)
