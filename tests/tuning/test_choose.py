@@ -290,7 +290,7 @@ def test_without_anything_finer_nothing_is_known_of_an_error(tmp_path, monkeypat
     made = chosen_document(tmp_path, depth_at("1 %"))
     assert choose(made).changes[KEYS[1]] == 2e-4
     forget_choices()
-    with pytest.raises(SpecError, match=r"best: grid, 0\.05 mm, .*raycast cannot be had: .*NVIDIA Warp"):
+    with pytest.raises(SpecError, match=r"best: grid, 0\.05 mm, .*raycast is not available: .*NVIDIA Warp"):
         choose(chosen_document(tmp_path, depth_at("0.01 %")))
     with pytest.raises(SpecError, match=r"grid, 0\.01 mm is the finest variant.*NVIDIA Warp"):
         choose(chosen_document(tmp_path, depth_at("0.01 %"), object=", tolerance: 0.01 mm"))

@@ -47,17 +47,17 @@ class Shared(NamedTuple):
     """How sensors share objects."""
 
     places: Places  # index of the way in which distances to each object are computed
-    alone: Mapping[str, Places]  # the same as each sensor would have it by itself
-    floors: Places  # of objects that sensors without an accuracy feel too, what they have
+    alone: Mapping[str, Places]  # the places that each sensor alone would choose
+    floors: Places  # places of objects that sensors without an accuracy sense too
 
 
 FORMAT = 2  # version of the choosing
 ENVS, STEPS = 16, 90
-"""Environments of the run, half of which choose and half verify (more where objects have more variants), and control steps."""
+"""Environments of the run (more if objects have more variants; one half chooses, the other verifies), and control steps."""
 
 
 class Task(NamedTuple):
-    """A document that is compiled, and the sensors in it that have an `accuracy`."""
+    """A document to compile, and its sensors with an `accuracy`."""
 
     document: Document
     overrides: Mapping[str, Any]
@@ -77,16 +77,16 @@ def choose(
 ) -> Choice:
     """Return the choice for the sensors of a document that have an `accuracy`.
 
-    A variant holds it if the RMS error of each quantity, against the finest variant in float64, is within the bound: with 95 %
-    confidence in one half of the environments of a scripted run, and as measured in the other half, which takes no part. Of
-    those the one with the fewest counted operations wins, then the one with the fewest bytes. The choice is cached.
+    A variant meets it if the RMS error of each quantity, against the finest variant in float64, is within the bound: with 95 %
+    confidence in one half of the environments of a scripted run, and as measured in the other half, which only verifies. The
+    variant with the fewest counted operations wins, then the one with the fewest bytes. The choice is cached.
 
     Args:
         document: The document.
         overrides: By dotted path YAML text, or a plain value. Values set there count as written.
-        kinds: Kinds in addition to tgdsl's and those of installed packages.
+        kinds: Kinds in addition to tgdsl's and installed packages'.
         progress: Called with a line of text for each long job.
-        sensors: Names of the sensors that are wanted; default: all.
+        sensors: Names of the sensors to compile; default: all.
 
     Raises:
         SpecError: If the document has mistakes, or nothing meets an `accuracy`.
@@ -96,7 +96,7 @@ def choose(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # its warnings appear when it is compiled
         task = task_of(document, overrides, kinds, progress, sensors)
-        return cached(key_of(task), lambda: _chosen(task), packed, unpacked) if task.wanted else Choice()
+        return cached(key_of(task), lambda: _measured_choice(task), packed, unpacked) if task.wanted else Choice()
 
 
 def _is_asked(document: Document, overrides: Mapping[str, Any] | None) -> bool:
@@ -146,7 +146,7 @@ def key_of(task: Task) -> str:
 
 
 def packed(choice: Choice) -> dict[str, np.ndarray]:
-    """Return what a cache file holds of a choice."""
+    """Return the arrays of a choice for a cache file."""
     text = json.dumps({"changes": dict(choice.changes), "notes": dict(choice.notes)})
     return {"choice": np.frombuffer(text.encode(), dtype=np.uint8)}
 
@@ -165,7 +165,7 @@ class Found(NamedTuple):
     level: Level
 
 
-def _chosen(task: Task) -> Choice:
+def _measured_choice(task: Task) -> Choice:
     """Measure and choose: for each sensor by itself, then with objects as fine as the strictest sensor needs."""
     recording, floors = _states(task), _floors(task.loaded, task.wanted)
 
@@ -175,24 +175,24 @@ def _chosen(task: Task) -> Choice:
         return Found(trial, *cheapest(trial, trial.fields(), trial.levels(floors)))
 
     result = _each(task, list(task.wanted), by_itself)
-    alone = {name: found.level.places for name, found in result.items()}
+    alone = {name: best.level.places for name, best in result.items()}
     places: dict[str, int] = {}
-    for own in alone.values():
-        places |= {target: max(place, places.get(target, place)) for target, place in own.items()}
+    for sensor_places in alone.values():
+        places |= {target: max(place, places.get(target, place)) for target, place in sensor_places.items()}
 
     def with_others(name: str) -> Found:
         trial, level = result[name].trial, level_of({target: places[target] for target in alone[name]})
         return Found(trial, *cheapest(trial, trial.fields(), [level]))
 
-    moved = [name for name, own in alone.items() if any(places[target] != place for target, place in own.items())]
+    moved = [name for name, ways in alone.items() if any(places[target] != place for target, place in ways.items())]
     result |= _each(task, moved, with_others)
-    changes = {key: value for found in result.values() for key, value in found.outcome.variant.changes.items()}
+    changes = {key: value for best in result.values() for key, value in best.outcome.variant.changes.items()}
     shared = Shared(places, alone, floors)
-    return Choice(changes, {name: account(found.trial, found.outcome, shared) for name, found in result.items()})
+    return Choice(changes, {name: account(best.trial, best.outcome, shared) for name, best in result.items()})
 
 
 def _each(task: Task, names: Sequence[str], work: Callable[[str], Found]) -> dict[str, Found]:
-    """Return what work returns of each sensor."""
+    """Return the result of `work` for each sensor; raise the mistakes of all sensors together."""
     result, problems = {}, []
     for name in names:
         try:
@@ -205,7 +205,7 @@ def _each(task: Task, names: Sequence[str], work: Callable[[str], Found]) -> dic
 
 
 def _floors(loaded: Loaded, wanted: Collection[str]) -> Places:
-    """Return the way of each object that sensors without an accuracy feel too: no coarser one is taken."""
+    """Return the distance query of each object that sensors without an accuracy sense too: no coarser one is chosen."""
     felt = {target for name, spec in loaded.spec.sensors.items() if name not in wanted for target in spec.objects}
     alternatives = query_alternatives()
     result = {}
@@ -216,7 +216,7 @@ def _floors(loaded: Loaded, wanted: Collection[str]) -> Places:
 
 
 def _states(task: Task) -> Recording:
-    """Return states of a run of the scene, with all that the sensors read without imperfections."""
+    """Return states of a run of the scene, with all fields that the sensors without imperfections read."""
     changes = {key: value for name in task.wanted for key, value in bare(name).items()}
     plan = compile_document(task.document, {**task.overrides, **changes}, task.kinds, task.progress, list(task.wanted)).plan
     inputs = plan.inputs

@@ -56,7 +56,7 @@ def compile(
         resolution: Resolution that replaces the document's.
         sensors: Names of the sensors to compile; default: all of the document.
         overrides: YAML text, or plain values, by dotted path, such as `{"sensors.touch.normal_stiffness": 400.0}`.
-        kinds: Your own sensor kinds, in addition to tgdsl's and those of installed packages: see `sensors.known`.
+        kinds: Your own sensor kinds, in addition to tgdsl's and installed packages': see `sensors.known`.
         dtype: Dtype of readings and computation, float32 or float64, or its name. Narrower floats would round positions by as
             much as penetration depths; cast the readings instead, `readings["s"].to(torch.bfloat16)`.
         device: Device of the module.

@@ -65,9 +65,9 @@ def control_ranges(model: mujoco.MjModel) -> Float[np.ndarray, "actuator 2"]:
 def varied(
     controls: Float[np.ndarray, "step actuator"], ranges: Float[np.ndarray, "actuator 2"], num_envs: int, seed: int
 ) -> Float[np.ndarray, "step env actuator"]:
-    """Return a script's controls as each environment has them: it goes further or less far, and sways; the first's are its own.
+    """Return a script's controls per environment: each goes further or less far, and sways; the first has the script's.
 
-    `ranges` are those of `control_ranges`.
+    `ranges` are from `control_ranges`.
     """
     rng = np.random.default_rng(seed)
     num_steps, num = controls.shape
@@ -126,8 +126,8 @@ def record(
 
 
 def _copy(state: SceneState) -> SceneState:
-    own = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
-    values: dict[str, Any] = {name: value.clone() if isinstance(value, Tensor) else value for name, value in own.items()}
+    parts = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
+    values: dict[str, Any] = {name: value.clone() if isinstance(value, Tensor) else value for name, value in parts.items()}
     return SceneState(**{**values, "substeps": tuple(_copy(part) for part in state.substeps)})
 
 

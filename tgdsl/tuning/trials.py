@@ -54,19 +54,19 @@ class Cost(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """A sensor of a document, without imperfections, and how its variants are compiled."""
+    """A sensor of a document, without imperfections, that compiles its variants."""
 
     document: Document  # the document
-    overrides: Mapping[str, Any]  # changes to it, imperfections left out
+    overrides: Mapping[str, Any]  # changes to it, including the removal of imperfections
     name: str  # the sensor's name
     kind: Kind  # its kind
     spec: AnySensorSpec  # its fields
     # kind and fields of all sensors of its Plan: itself and the sensors it reads
     others: Mapping[str, tuple[Kind, AnySensorSpec]]
-    queried: Mapping[str, ObjectSpec]  # of the objects with meshes that it feels, their fields
-    own: Plan  # the Plan of the document's own variant
+    queried: Mapping[str, ObjectSpec]  # fields of the objects with meshes that it senses
+    own: Plan  # the Plan of the document's variant
     variants: Variants  # the variants
-    kinds: Sequence[Kind] = ()  # kinds in addition to tgdsl's and those of installed packages
+    kinds: Sequence[Kind] = ()  # kinds in addition to tgdsl's and installed packages'
     plans: dict[str, Plan] = field(default_factory=dict)  # plans so far, by their changes
 
     @staticmethod
@@ -77,11 +77,11 @@ class Sensor:
             warnings.simplefilter("ignore")
             loaded = load(document, changed, all_kinds)
         plan, by_name = quiet_plan(document, changed, name, kinds), {kind.name: kind for kind in all_kinds}
-        others = {s.sensor: (by_name[s.kind], loaded.spec.sensors[s.sensor]) for s in plan.sensors}
-        kind, spec = others[name]
+        specs = {s.sensor: (by_name[s.kind], loaded.spec.sensors[s.sensor]) for s in plan.sensors}
+        kind, spec = specs[name]
         queried = {target: loaded.spec.objects[target] for target in queried_objects(plan)}
         variants = variants_of(kind, name, spec, queried, query_alternatives())
-        return Sensor(document, changed, name, kind, spec, others, queried, plan, variants, kinds)
+        return Sensor(document, changed, name, kind, spec, specs, queried, plan, variants, kinds)
 
     @property
     def reading(self) -> PlannedReading:
@@ -114,30 +114,30 @@ class Sensor:
 
 
 def quiet_plan(document: Document, overrides: Mapping[str, Any], name: str, kinds: Sequence[Kind] = ()) -> Plan:
-    """Return the Plan of one sensor, without what compiling the whole document warns of."""
+    """Return the Plan of one sensor, without the document's warnings."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return compile_document(document, overrides, kinds, sensors=[name]).plan
 
 
 class Exact(NamedTuple):
-    """What errors of a sensor are measured against."""
+    """The reference of a sensor's errors."""
 
     variant: Variant  # the finest available variant
     module: TactileModule  # the document's own variant in float64, whose rows readings are compared at
-    readings: Float[np.ndarray, "step env row channel"]  # the finest variant's, in float64, at those rows
-    magnitude: Magnitude  # what errors are relative to
-    quantities: tuple[str, ...]  # what each channel is a component of
+    readings: Float[np.ndarray, "step env row channel"]  # the finest variant's readings, in float64, at these rows
+    magnitude: Magnitude  # magnitude to which errors are relative
+    quantities: tuple[str, ...]  # the quantity of each channel
     units: tuple[str, ...]  # the unit of each channel
 
 
 def exact_of(sensor: Sensor, finest: Variant, recording: Recording, progress: Progress = silent) -> Exact:
-    """Return what errors of a sensor are measured against, given its finest variant (see `finest_of`) and recorded states."""
+    """Return the reference of a sensor's errors, from its finest variant (see `finest_of`) and recorded states."""
     progress(f"{sensor.name}: {finest.label}, float64")
     exact = sensor.module(sensor.own, torch.float64)
     fine = sensor.module(sensor.plan(finest), torch.float64)
-    found = readings_of(fine, recording.for_module(fine.inputs), sensor.name)
-    readings = common_of(exact, fine, sensor.name).of_other(found)
+    fine_readings = readings_of(fine, recording.for_module(fine.inputs), sensor.name)
+    readings = common_of(exact, fine, sensor.name).of_other(fine_readings)
     quantities = tuple(quantity(channel) for channel in sensor.reading.channels)
     return Exact(finest, exact, readings, magnitude_of(readings, quantities), quantities, tuple(sensor.reading.units))
 
@@ -155,7 +155,7 @@ def finest_of(sensor: Sensor, left_out: dict[str, str]) -> Variant:
 
 
 def cost_of(touch: TactileModule, size: int) -> Cost:
-    """Return the counted cost of a module that returns numbers of `size` bytes; its state is that of a single call."""
+    """Return the counted cost of a module whose outputs have `size` bytes per number; its state is a single call's."""
     state = touch.example_state(2)
     with torch.no_grad():
         touch(state)
@@ -170,7 +170,7 @@ def cost_of(touch: TactileModule, size: int) -> Cost:
 
 
 class Level(NamedTuple):
-    """A way to find distances to the meshes that a sensor feels."""
+    """A distance query for each mesh that a sensor senses."""
 
     variant: Variant
     places: Places
@@ -180,16 +180,16 @@ class Level(NamedTuple):
 class Outcome:
     """A variant, measured."""
 
-    variant: Variant  # it
-    cost: Cost  # what it takes, counted
-    chosen: Mapping[str, Errors]  # errors of each quantity in the environments that variants are compared in
-    verified: Mapping[str, Errors]  # the same in the others, which take no part
+    variant: Variant  # the variant
+    cost: Cost  # its counted cost
+    chosen: Mapping[str, Errors]  # errors of each quantity in the environments that choose
+    verified: Mapping[str, Errors]  # errors in the environments that verify
     excess: float  # largest upper end of an interval of `chosen` over its bound: at most 1 if the accuracy is held
     verified_excess: float  # largest error of `verified` over its bound
 
     @property
     def is_held(self) -> bool:
-        """Whether the accuracy is held, in the environments that take no part too."""
+        """Whether the accuracy is met, also in the environments that verify."""
         return self.excess <= 1 and self.verified_excess <= 1
 
 
@@ -211,11 +211,11 @@ class Trial:
         self._check_states()
 
     def channels(self, quantity: str) -> list[int]:
-        """Return which channels are components of a quantity."""
+        """Return the indices of a quantity's channels."""
         return [i for i, other in enumerate(self.exact.quantities) if other == quantity]
 
     def fields(self) -> list[Variant]:
-        """Return the choices of the sensor's fields whose errors can be measured and that change nothing that is written."""
+        """Return the choices of the sensor's fields whose errors can be measured and that change no field that is set."""
         candidates = [choice for choice in self.sensor.variants.fields if choice.label not in self.left_out]
         finest = candidates[-1] if candidates else None
         if finest is not None and not finest.is_exact:
@@ -229,9 +229,9 @@ class Trial:
         return results
 
     def levels(self, floors: Places) -> list[Level]:
-        """Return the ways to find distances to meshes, from coarse to fine, that change nothing that is written.
+        """Return the levels of distance queries, from coarse to fine, that change no field that is set.
 
-        No way is coarser than an object's in `floors`, which sensors without an accuracy feel too.
+        No query is coarser than an object's in `floors`, which sensors without an accuracy sense too.
         """
         alternatives = query_alternatives()
         candidates = [i for i, choice in enumerate(alternatives) if choice.label not in self.left_out]
@@ -258,13 +258,13 @@ class Trial:
             if cost is None:
                 return None
             self._progress(f"{self.sensor.name}: {variant.label}, errors")
-            chosen, verified = self._errors(variant)
+            choosing, verified = self._errors(variant)
             self.outcomes[variant.label] = Outcome(
                 variant,
                 cost,
-                chosen,
+                choosing,
                 verified,
-                max(errors.rms.high / self.bounds[name].value for name, errors in chosen.items()),
+                max(errors.rms.high / self.bounds[name].value for name, errors in choosing.items()),
                 max(errors.rms.value / self.bounds[name].value for name, errors in verified.items()),
             )
         return self.outcomes[variant.label]
@@ -306,7 +306,7 @@ class Trial:
 
 
 def level_of(places: Places) -> Level:
-    """Return the variant in which objects find distances in given ways."""
+    """Return the level with a given distance query for each object."""
     alternatives = query_alternatives()
     changes = {f"objects.{name}.{key}": v for name, i in places.items() for key, v in alternatives[i].changes.items()}
     labels = dict.fromkeys(alternatives[i].label for i in places.values())
@@ -321,10 +321,10 @@ def _joined(fields: Variant, level: Level) -> Variant:
 
 
 def cheapest(trial: Trial, fields: Sequence[Variant], levels: Sequence[Level]) -> tuple[Outcome, Level]:
-    """Return the cheapest variant that holds an accuracy, and how it finds distances: fewest operations, then fewest bytes.
+    """Return the cheapest variant that meets an accuracy, and its distance queries: fewest operations, then fewest bytes.
 
-    Where both can be chosen, variants that miss it even with the finest of the other kind are dropped first. A `LowerError`
-    names the best if none holds it.
+    If fields and queries are both free, choices that miss it even with the finest of the other are dropped first. A
+    `LowerError` names the best variant if none meets it.
     """
     fields, levels = list(fields), list(levels)
     if len(fields) > 1 and len(levels) > 1:
@@ -353,12 +353,12 @@ def _missed(trial: Trial) -> LowerError:
     problem = f"nothing that is free to choose holds {trial.accuracy}; best: {best.variant.label}, {shown_errors(trial, best)}"
     written = written_fields(trial)
     hints = [f"{listed(written)} stay{'s' if len(written) == 1 else ''} as written"] if written else []
-    hints += [f"{label} cannot be had: {why}" for label, why in trial.left_out.items()]
+    hints += [f"{label} is not available: {why}" for label, why in trial.left_out.items()]
     return LowerError(problem, "accuracy", "; ".join([*hints, f"errors are against {trial.exact.variant.label}"]))
 
 
 def written_fields(trial: Trial) -> list[str]:
-    """Return the fields that other choices would change if nobody had written them, by dotted path."""
+    """Return the fields that are set and that other choices would change, by dotted path."""
     sensor = trial.sensor
     results = [f"sensors.{sensor.name}.{key}" for key in written_of(sensor.spec, sensor.kind.alternatives(sensor.spec))]
     for name, spec in sensor.queried.items():
@@ -385,5 +385,5 @@ def shown(error: float, bound: Bound) -> str:
 
 
 def brief(value: float) -> str:
-    """Return two digits of a number, and all before the point."""
+    """Return a number with two digits, or all before the point."""
     return f"{value:.0f}" if 100 <= value < 1e6 else f"{value:.2g}"
