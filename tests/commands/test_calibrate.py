@@ -73,7 +73,7 @@ def test_calibrate_with_loads(pressed, here, tmp_path):
     assert calibration.tare[1] == pytest.approx(TARE[1], abs=1e-4)
     text = (tmp_path / "out" / "hand.yaml").read_text()
     assert text.startswith("# index: fitted to press.npz; scale 0.05000 0.05000 0.02000 N per count, ")
-    assert "# ring: not loaded; scale and rotation are those of index\n" in text
+    assert "# ring: not loaded; scale and rotation as for index\n" in text
     assert said.splitlines()[0].startswith(f"index: {12 * len(PRESSES)} readings; scale 0.05000")
     assert said.splitlines()[-2:] == ["calibration: out/hand.yaml", "picture:     hand.calibration.png"]
     assert (tmp_path / "hand.calibration.png").read_bytes().startswith(b"\x89PNG")

@@ -79,16 +79,16 @@ Overrides = Annotated[
 
 
 def subcommands(*commands: type, **named: type) -> Any:
-    """Return the union of commands, each by its class's name in lower case, or by a name of its own."""
+    """Return the union of commands, each by its class's name in lower case, or by a given name."""
     by_name = {re.sub(r"(?<!^)(?=[A-Z])", "-", command.__name__).lower(): command for command in commands} | named
     return Union[tuple(Annotated[command, tyro.conf.subcommand(name)] for name, command in by_name.items())]  # type: ignore[return-value]  # noqa: UP007
 
 
 def robot_document(hand: str, layout: Path | None) -> Path | dict[str, object]:
-    """Return the document that an argument names, or one of just a robot and its layout.
+    """Return the document that an argument names, or a document of a robot and its layout only.
 
     Raises:
-        TgdslError: If it names nothing, or a robot that comes without a layout.
+        TgdslError: If it names nothing, or a robot without a layout.
     """
     from tgdsl.files.find import is_file, layout_of, robot_names
 
@@ -118,7 +118,7 @@ def parsed_overrides(pairs: tuple[str, ...]) -> dict[str, str]:
 
 
 def joined_overrides(before: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
-    """Return older overrides, but for those at or below a newer one's key, then the newer ones."""
+    """Return older overrides, without those at or below a newer one's key, then the newer ones."""
     unchanged = {key: value for key, value in before.items() if not any(f"{key}.".startswith(f"{other}.") for other in new)}
     return unchanged | dict(new)
 
@@ -138,7 +138,7 @@ def module_of(document: Path, overrides: tuple[str, ...] = (), progress: Progres
 def actor_for(
     env: TouchEnv, saved: PolicyFile | None, actions: str = "zero", seed: int = 0, groups: tuple[str, ...] = ()
 ) -> Actor:
-    """Return a policy that acts in a task's environments, or without one the actor of `--actions`; print what has changed."""
+    """Return a policy for a task's environments, or without one the actor of `--actions`; print the changes since training."""
     from tgdsl.rl.playing.policy import policy_for
     from tgdsl.rl.playing.rollout import actor_of
 

@@ -69,7 +69,7 @@ class CalibrateSensor:
         options: dict[str, Any] = {name: getattr(self, name) for name in names} | {"overrides": args.parsed_overrides(self.set)}
         if self.compare is not None:
             if self.fit or self.out is not None or self.plot is not None:
-                raise TgdslError("--compare prints a table of its own models, expected no --fit, --out or --plot")
+                raise TgdslError("--compare prints a table of several models, expected no --fit, --out or --plot")
             with StatusLine() as progress:
                 table = compare(self.document, list(self.recordings), self.compare, progress=progress, **options)
             print(table)
@@ -149,7 +149,7 @@ class CalibrateHand:
         result = calibrated(base, fits, self.others)
         print("\n".join(report(fits, samples)))
         notes = [f"# {name}: fitted to {self.log.name}; {fit_text(fit)}\n" for name, fit in fits.items()]
-        origin = f"scale and rotation are those of {self.others}" if self.others else "as in the calibration before"
+        origin = f"scale and rotation as for {self.others}" if self.others else "as in the calibration before"
         notes += [f"# {name}: not loaded; {origin}\n" for name in FINGERS if name not in fits]
         atomic_write(with_folder(self.out), ("".join(notes) + result.text()).encode())
         print(f"calibration: {self.out}")

@@ -73,10 +73,10 @@ class Distill:
             raise TgdslError(f"--out {self.out}: a run goes on in its own folder, {self.resume}")
         folder = self.resume or self.out or Path("out") / f"{self.task.stem}_students"
         last_start = _read(folder) if self.resume else {}
-        given = args.parsed_overrides(self.set)
-        overrides = args.joined_overrides(last_start.get("overrides", {}), given)
+        new = args.parsed_overrides(self.set)
+        overrides = args.joined_overrides(last_start.get("overrides", {}), new)
         loaded = load_task(self.task, overrides)
-        self._check(given, last_start.get("overrides", {}))
+        self._check(new, last_start.get("overrides", {}))
         settings = self._settings(loaded, last_start, folder)
         parts = [_Part(self, name, settings, overrides, folder / name) for name in settings["resolutions"]]
         settings["envs"] = parts[0].envs
@@ -230,7 +230,7 @@ class _Part:
             env.close()
 
     def _print_changes(self, origin: dict[str, Any]) -> None:
-        """Print what has changed since the run was last started."""
+        """Print the changes since the run's last start."""
         from tgdsl.rl.train.folder import changes
 
         last_start = self._folder.last_start()
@@ -272,8 +272,8 @@ def _check_new(folder: Path, resolutions: list[str]) -> None:
     """Raise an error if a folder holds a run already."""
     if (folder / "distill.json").exists():
         raise TgdslError(f"{folder}: this folder holds a run; go on with --resume {folder}, or give another --out")
-    others = [folder / name / file for name in resolutions for file in ("run.json", "checkpoint.pt")]
-    for file in (folder / "table.csv", *others):
+    student_files = [folder / name / file for name in resolutions for file in ("run.json", "checkpoint.pt")]
+    for file in (folder / "table.csv", *student_files):
         if file.exists():
             raise TgdslError(f"{folder}: this folder holds {file.relative_to(folder)} of a run; give another --out")
 

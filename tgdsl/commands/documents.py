@@ -211,18 +211,18 @@ class Listen:
         picture = check_writable(self.out / "spectrogram.png")
         with StatusLine() as progress:
             touch = args.module_of(self.document, self.set, progress)
-            chosen = self._chosen(touch)
-            files = {sensor.name: check_writable(self.out / f"{sensor.name}.wav") for sensor in chosen}
+            sensors = self._audio_sensors(touch)
+            files = {sensor.name: check_writable(self.out / f"{sensor.name}.wav") for sensor in sensors}
             if self.compiled:
                 touch.compile()
-        sounds = self._sounds(touch, chosen)
+        sounds = self._sounds(touch, sensors)
         for sound in sounds:
             gain = write_wav(sound, files[sound.name])
             level = "silent" if not sound.samples.any() else f"full scale is {1 / gain:.3g} {sound.unit}"
             print(f"{sound.name}: {files[sound.name]}, {round(sound.rate)} Hz, {level}")
         print(f"spectrogram: {draw(sounds, picture, self.document.stem)}")
 
-    def _chosen(self, touch: TactileModule) -> list[PlannedSensor]:
+    def _audio_sensors(self, touch: TactileModule) -> list[PlannedSensor]:
         """Return the sensors to listen to."""
         from tgdsl.view.sound import sounding
 
@@ -299,7 +299,7 @@ class Verify:
     of: args.OptionalFile = None
     """The document or artefact; default: the path from which the file was exported."""
     calls: int = 100
-    """Calls in a row for each batch size; state is kept between them."""
+    """Calls in a row for each batch size; state carries over from call to call."""
 
     def run(self) -> None:
         from tgdsl.module.export.program import read_signature

@@ -45,12 +45,12 @@ class Copy:
     """Folder in which examples/, robots/ and policies/ are created."""
 
     def run(self) -> None:
-        known, top = example_names(), shared_folder().resolve()
+        examples, top = example_names(), shared_folder().resolve()
         names = [name.removeprefix("examples/").removesuffix(".yaml") for name in self.names]
         for name in names:
-            if name not in known:
-                raise TgdslError(f'there is no example "{name}"; {did_you_mean(name, known, "examples")}')
-        files = files_named_by([known[name] for name in names or known])
+            if name not in examples:
+                raise TgdslError(f'there is no example "{name}"; {did_you_mean(name, examples, "examples")}')
+        files = files_named_by([examples[name] for name in names or examples])
         contents = {self.out / file.relative_to(top): file.read_bytes() for file in files}
         if changed := [str(file) for file, content in contents.items() if file.exists() and file.read_bytes() != content]:
             raise TgdslError(f"already there, with other content: {listed(changed)}; remove them, or name another folder by -o")
@@ -85,14 +85,14 @@ def summary_of(file: Path) -> str:
 
 
 def files_named_by(files: list[Path]) -> list[Path]:
-    """Return files, those that their text names, and so on: of a robot its whole folder, of a task its policies too."""
-    found: set[Path] = set()
+    """Return files and, recursively, the files that they name: for a robot its folder, for a task its policies too."""
+    result: set[Path] = set()
     queue = [file.resolve() for file in files]
     while queue:
-        if (file := queue.pop()) not in found:
-            found.add(file)
+        if (file := queue.pop()) not in result:
+            result.add(file)
             queue += _named_in(file, shared_folder().resolve())
-    return sorted(found)
+    return sorted(result)
 
 
 def _named_in(file: Path, top: Path) -> Iterator[Path]:

@@ -1,7 +1,7 @@
 """`tgdsl hand`: all commands on a real hand. None can move a joint.
 
-What is sent are version and register requests, which hold no set-point, and the exchange that asks for mode 0 with no gain and
-no current: its reply is the only reading of touch that is known.
+They send version and register requests, which hold no set-point, and the exchange that requests mode 0 without gain or current:
+its reply is the only known reading of touch.
 """
 
 from __future__ import annotations
@@ -85,9 +85,9 @@ class Monitor:
         from tgdsl.runtime.xhand1.wire.ports import the_hand
         from tgdsl.view.hand_table import HandView
 
-        calibration, found = args.calibration_of(self.calibration), the_hand(self.port, self.hand_id)
-        view = HandView(calibration, f"{found.device}: hand {found.addresses.hand_id}")
-        with XHand1.open(found.device, found.addresses) as hand, _until_ctrl_c(view):
+        calibration, hand_port = args.calibration_of(self.calibration), the_hand(self.port, self.hand_id)
+        view = HandView(calibration, f"{hand_port.device}: hand {hand_port.addresses.hand_id}")
+        with XHand1.open(hand_port.device, hand_port.addresses) as hand, _until_ctrl_c(view):
             for event in events(hand, self.seconds):
                 view.show(event)
 
@@ -115,8 +115,8 @@ class Tare:
         from tgdsl.runtime.xhand1.wire.protocol import FINGERS
 
         args.refuse_to_replace(self.out, self.force)
-        base, found = args.calibration_of(self.calibration) or Calibration.none(), the_hand(self.port, self.hand_id)
-        with XHand1.open(found.device, found.addresses) as hand:
+        base, hand_port = args.calibration_of(self.calibration) or Calibration.none(), the_hand(self.port, self.hand_id)
+        with XHand1.open(hand_port.device, hand_port.addresses) as hand:
             tare = _tare(hand, self.frames)
         spreads = [
             f"{name} {axis} by {spread:g}"
@@ -167,12 +167,12 @@ class Record:
         args.refuse_to_replace(self.out, self.force)
         if not self.seconds > 0:
             raise TgdslError(f"--seconds {self.seconds:g}: expected more than 0")
-        calibration, found = args.calibration_of(self.calibration), the_hand(self.port, self.hand_id)
-        identity = identify(found)
+        calibration, hand_port = args.calibration_of(self.calibration), the_hand(self.port, self.hand_id)
+        identity = identify(hand_port)
         view = HandView(calibration, str(identity))
         with (
             LogWriter(with_folder(self.out), identity=identity, calibration=calibration) as log,
-            XHand1.open(found.device, found.addresses) as hand,
+            XHand1.open(hand_port.device, hand_port.addresses) as hand,
             _until_ctrl_c(view),
         ):
             for event in events(hand, self.seconds):

@@ -290,8 +290,8 @@ class Grasps:
 
         if self.out is not None:
             check_writable(self.out)
-        given = {f"grasps.{name}": value for name in ("num", "seed") if (value := getattr(self, name)) is not None}
-        loaded = load_task(self.document, args.parsed_overrides(self.set) | given)
+        overrides = {f"grasps.{name}": value for name in ("num", "seed") if (value := getattr(self, name)) is not None}
+        loaded = load_task(self.document, args.parsed_overrides(self.set) | overrides)
         spec = grasp_spec(loaded.spec)
         if spec is None:
             raise TgdslError(f"{self.document}: episodes of the task {loaded.spec.task} do not begin with grasps")
@@ -309,5 +309,5 @@ class Grasps:
         if self.out is not None:
             write_grasps(grasps, self.out)
             print(f"file: {self.out}")
-        elif given:
+        elif overrides:
             print("the task finds these where its document, or --set, has the same `grasps: {num, seed}`")

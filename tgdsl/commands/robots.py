@@ -172,7 +172,7 @@ class Render:
         print(f"picture: {path}")
 
     def _placed(self, progress: StatusLine) -> Placed:
-        """Return the model and the layouts to draw by resolution: an artefact's, or those of a document."""
+        """Return the model and the layouts to draw by resolution, from an artefact or a document."""
         from tgdsl.compiler.pipeline import Placed, placed
         from tgdsl.module.artifact import load_plan
         from tgdsl.scene.scene import scene_model

@@ -1,4 +1,4 @@
-"""`tgdsl sweep`: one command for every combination of some settings, on Ray; and one run of it, in a process of its own."""
+"""`tgdsl sweep`: one command for every combination of some settings, on Ray; and one of its runs, in a separate process."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Sweep:
     address: Annotated[str | None, optional("ADDRESS")] = None
     """Address of a Ray cluster, as for ray.init; default: this machine, with all its cores and GPUs."""
     out: OptionalOutFolder = None
-    """Folder of all runs; default: out/NAME, by the document's name. Finished runs in it are kept, others continue."""
+    """Folder of all runs; default: out/NAME, by the document's name. Finished runs in it stay, others continue."""
 
     def run(self) -> None:
         from tgdsl.commands.sweep_document import load_sweep

@@ -27,7 +27,7 @@ LONGEST = 200  # most characters of a run's name, which is a folder's
 
 
 class SweepSpec(SpecModel):
-    """Settings whose combinations are run, each by a command of its own."""
+    """Settings whose combinations are run, each by a separate command."""
 
     tgdsl: Literal[1]
     """Version of the grammar."""
@@ -54,7 +54,7 @@ class Trial:
 
     name: str
     settings: dict[str, Any]  # its values of the matrix
-    words: tuple[str, ...]  # of the command line, but for `--out` and `--resume`
+    words: tuple[str, ...]  # of the command line, without `--out` and `--resume`
 
 
 def load_sweep(file: Path) -> tuple[SweepSpec, list[Trial]]:
