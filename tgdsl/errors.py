@@ -1,4 +1,4 @@
-"""Errors that a user can act on: what was found, where, and what would be right."""
+"""Errors that a user can act on: the actual value, its place, and the expected one."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ class SampleError(TgdslError):
 
 
 class LowerError(TgdslError):
-    """What a kind of sensor cannot do on the links that it was put on; `field` of its spec is at fault, if given."""
+    """A sensor that its kind cannot compute on its links; `field` of its spec is at fault, if given."""
 
     def __init__(self, what: str, field: str = "", hint: str = ""):
         self.what, self.field, self.hint = what, field, hint
@@ -121,18 +121,18 @@ class LowerError(TgdslError):
 
 def did_you_mean(found: str, names: Iterable[str], what: str = "names") -> str:
     """Return a hint that names the nearest known name, or else lists what exists."""
-    known = sorted(set(names))
-    if not known:
+    valid = sorted(set(names))
+    if not valid:
         return f"there are no {what}"
-    similar = [name for name in known if abs(len(name) - len(found)) <= 3 or name.startswith(found)]
+    similar = [name for name in valid if abs(len(name) - len(found)) <= 3 or name.startswith(found)]
     near = difflib.get_close_matches(found, similar, n=1, cutoff=0.6)
     if near:
         return f'did you mean "{near[0]}"?'
-    return f"known {what}: {listed(known, limit=20)}"
+    return f"known {what}: {listed(valid, limit=20)}"
 
 
 def raised_at(file: str, error: Exception) -> str:
-    """Return a file of a user's own code, and the line in it that an error comes from, if any: `task.py:12`."""
+    """Return a file of a user's code, with the line from which an error comes, if any: `task.py:12`."""
     if isinstance(error, SyntaxError) and error.filename == file:
         return f"{file}:{error.lineno}"
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
@@ -141,5 +141,5 @@ def raised_at(file: str, error: Exception) -> str:
 
 def listed(names: Sequence[str], limit: int = 12) -> str:
     """Return names joined by commas, the tail counted rather than printed."""
-    shown = ", ".join(names[:limit])
-    return shown if len(names) <= limit else f"{shown} and {len(names) - limit} more"
+    text = ", ".join(names[:limit])
+    return text if len(names) <= limit else f"{text} and {len(names) - limit} more"

@@ -11,11 +11,11 @@ from types import TracebackType
 from typing import TextIO
 
 LINE_PERIOD = 5.0  # time between lines where there is no terminal [s]
-Progress = Callable[[str], None]  # called with what is done next, such as "object mug: distance grid"
+Progress = Callable[[str], None]  # called with the next job, such as "object mug: distance grid"
 
 
 def silent(what: str) -> None:
-    """Say nothing."""
+    """Ignore the job."""
 
 
 class StatusLine:

@@ -22,7 +22,7 @@ def text_table(header: Sequence[str], rows: Iterable[Sequence[str]], more: int =
 
 
 def listing(entries: Iterable[tuple[str, str]], indent: str = "  ") -> str:
-    """Return names and what each holds, wrapped beside its name."""
+    """Return names with their texts, wrapped to the right of the name."""
     entries = list(entries)
     width = max((len(name) for name, _ in entries), default=0) + 2
     lines = []
@@ -33,14 +33,14 @@ def listing(entries: Iterable[tuple[str, str]], indent: str = "  ") -> str:
 
 
 def shapes(value: Any) -> str:
-    """Return dtype and shape of a tensor, or those of all tensors of a mapping by name; of anything else its type's name."""
+    """Return dtype and shape of a tensor, or of each tensor of a mapping by name; for anything else its type's name."""
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {shapes(part)}" for name, part in value.items())
     return f"{value.dtype} {tuple(value.shape)}".removeprefix("torch.") if hasattr(value, "dtype") else type(value).__name__
 
 
 def with_units(channels: Sequence[str], units: Sequence[str]) -> str:
-    """Return channels, each unit once after those that have it: `force_x, force_y, force_z [N]`."""
+    """Return channels, each unit once after its last channel: `force_x, force_y, force_z [N]`."""
     parts = []
     for i, (channel, unit) in enumerate(zip(channels, units, strict=True)):
         is_last = i + 1 == len(units) or units[i + 1] != unit
@@ -69,7 +69,7 @@ class Observations(dict[str, tuple[Any, ...]]):
 
 
 class TaxelTable(np.ndarray):
-    """A structured array that prints as a table, a row per taxel; what is taken out of it is an ordinary array."""
+    """A structured array that prints as a table, a row per taxel; its columns are ordinary arrays."""
 
     def __getitem__(self, key: Any) -> Any:
         result = super().__getitem__(key)
@@ -103,7 +103,7 @@ class TaxelTables(dict[str, TaxelTable]):
 
 
 def _links(table: TaxelTable) -> str:
-    """Return a row per link: its body, how many taxels it has, their radius or range of radii, and their area."""
+    """Return a row per link: its body, its number of taxels, their radius or range of radii, and their area."""
     rows = []
     for link in dict.fromkeys(table["link"].tolist()):
         link_rows = table[table["link"] == link]
@@ -114,7 +114,7 @@ def _links(table: TaxelTable) -> str:
 
 
 def spelled(value: Any) -> str:
-    """Return what a field holds: names joined by commas, pairs as `link – object`, mappings as `key: value`."""
+    """Return a field as text: names joined by commas, pairs as `link – object`, mappings as `key: value`."""
     if isinstance(value, Mapping):
         return ", ".join(f"{key}: {spelled(part)}" for key, part in value.items())
     if isinstance(value, tuple):

@@ -1,7 +1,7 @@
-"""What takes long to compute, kept as arrays in the user's cache folder under a hash of what it was computed from.
+"""Cache of expensive results: arrays in the user's cache folder, under a hash of their inputs.
 
-The folder has a bound: the least recently used files go first. Several processes may use it at once: files appear whole and go
-whole, whoever has one open reads it to its end, and all evict files in the same order.
+The folder's size is bounded: the least recently used files are removed first. Several processes may use it at once: files
+appear and disappear whole, an open file can be read to its end, and all processes evict files in the same order.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from tgdsl.errors import FileError, TgdslError
 from tgdsl.files.write import TEMPORARY, atomic_open, with_folder
 
 T = TypeVar("T")
-MAX_BYTES = 2 * 2**30  # size that the folder is kept to, if `TGDSL_CACHE_BYTES` gives no other
+MAX_BYTES = 2 * 2**30  # largest size of the folder, unless `TGDSL_CACHE_BYTES` sets another
 _ENTRY = re.compile(r"[0-9a-f]{64}\.npz")
 _TEMPORARY = re.compile(TEMPORARY.pattern + r"\.npz")
-_ABANDONED = 3600.0  # age at which an unfinished file is one whose process has ended [s]
+_ABANDONED = 3600.0  # age from which an unfinished file counts as abandoned [s]
 
 
 def folder() -> Path:
@@ -40,7 +40,7 @@ def folder() -> Path:
 
 
 def max_bytes() -> int:
-    """Return the size that the folder is kept to: `TGDSL_CACHE_BYTES`, or `MAX_BYTES`."""
+    """Return the largest size of the folder [bytes]: `TGDSL_CACHE_BYTES`, or `MAX_BYTES`."""
     limit = os.environ.get("TGDSL_CACHE_BYTES", "")
     if limit and not limit.isdecimal():
         raise TgdslError(f'TGDSL_CACHE_BYTES is "{limit}", expected a number of bytes such as {MAX_BYTES}')
@@ -57,7 +57,7 @@ class Entry:
 
 
 def entries() -> list[Entry]:
-    """Return the files of the cache, the least recently used first; other files in the folder are none of it."""
+    """Return the files of the cache, the least recently used first; other files in the folder do not belong to it."""
     results = []
     for file in folder().glob("*") if folder().is_dir() else ():
         with contextlib.suppress(OSError):  # another process has just removed it
@@ -69,13 +69,13 @@ def entries() -> list[Entry]:
 
 
 def evict(limit: int) -> list[Entry]:
-    """Remove the least recently used files until the cache is no larger than a limit [bytes]; return what was removed."""
+    """Remove the least recently used files until the cache is within a limit [bytes]; return the removed ones."""
     cached = entries()
     size, removed = sum(entry.size for entry in cached), []
     for entry in cached:
         if size <= limit:
             break
-        size -= entry.size  # also if another process has removed it: that one counted it too
+        size -= entry.size  # also if another process has removed it
         try:
             entry.file.unlink()
             removed.append(entry)
@@ -98,7 +98,7 @@ def cached(
     pack: Callable[[T], Mapping[str, np.ndarray]],
     unpack: Callable[[Mapping[str, np.ndarray]], T],
 ) -> T:
-    """Return what the cache file `key` holds, or else make it and write one.
+    """Return the value in the cache file `key`, or else compute it and write the file.
 
     `unpack` returns the value of arrays that `pack` returned, or raises ValueError, KeyError, IndexError or TypeError.
     """
@@ -106,8 +106,8 @@ def cached(
     try:
         with file.open("rb") as raw, np.load(raw, allow_pickle=False) as archive:
             value = unpack(archive)
-        with contextlib.suppress(OSError):  # it is somebody else's, or was just removed
-            os.utime(file)  # many file systems do not note when one was read
+        with contextlib.suppress(OSError):  # another user's file, or one that was just removed
+            os.utime(file)  # many file systems do not record access times
         return value
     except (OSError, ValueError, KeyError, IndexError, TypeError, EOFError, zipfile.BadZipFile, zlib.error):
         pass  # there is none, or it is damaged
@@ -119,7 +119,7 @@ def cached(
 
 
 def cached_record(key: str, make: Callable[[], T], kind: type[T]) -> T:
-    """Return a dataclass that a cache file holds, or else make it and write one; see `cached`.
+    """Return a dataclass from a cache file, or else compute it and write the file; see `cached`.
 
     Its fields are arrays of finite numbers, numbers, texts, tuples of these, and dataclasses of numbers or None.
     """

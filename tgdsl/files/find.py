@@ -1,4 +1,4 @@
-"""Where files are: those that a document names, and the robots and examples that come with tgdsl."""
+"""Paths of files that a document names, and of the robots and examples that come with tgdsl."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _PACKAGE = Path(tgdsl.__file__).parent
 
 
 def is_file(path: Path) -> bool:
-    """Return whether there is such a file; unlike `Path.is_file`, also of names that no file can have."""
+    """Return whether there is such a file; unlike `Path.is_file`, False for names that no file can have."""
     return os.path.isfile(path)
 
 
@@ -47,7 +47,7 @@ def robot_file(model: str, folder: Path) -> Path | None:
 
 
 def robot_path(robot: str) -> Path:
-    """Return the file of a robot given by a path, or of one that tgdsl brings, by its name.
+    """Return the file of a robot given by its path, or by the name of one that comes with tgdsl.
 
     Raises:
         TgdslError: If there is neither.
@@ -59,22 +59,22 @@ def robot_path(robot: str) -> Path:
 
 
 def layout_file(model: Path) -> Path | None:
-    """Return the layout beside a model file: of `hand_left.xml` in `hand/` it is `layout_left.yaml`, or else `layout.yaml`."""
-    return _beside(model, "layout")
+    """Return the layout next to a model file: for `hand/hand_left.xml`, `layout_left.yaml` or else `layout.yaml`."""
+    return _next_to(model, "layout")
 
 
 def colliders_file(model: Path) -> Path | None:
-    """Return the colliders beside a model file: of `hand_left.xml` it is `colliders_left.yaml`, or else `colliders.yaml`."""
-    return _beside(model, "colliders")
+    """Return the colliders next to a model file: for `hand/hand_left.xml`, `colliders_left.yaml` or else `colliders.yaml`."""
+    return _next_to(model, "colliders")
 
 
-def _beside(model: Path, name: str) -> Path | None:
+def _next_to(model: Path, name: str) -> Path | None:
     side = model.stem.removeprefix(f"{model.parent.name}_")
     names = (f"{name}_{side}.yaml", f"{name}.yaml")
     return next((model.parent / name for name in names if (model.parent / name).is_file()), None)
 
 
 def layout_of(robot: str) -> Path | None:
-    """Return the layout that lies beside a robot, which is given by name or by its file."""
+    """Return the layout next to a robot's file; the robot is given by name or by its file."""
     model = robot_file(robot, Path())
     return None if model is None else layout_file(model)

@@ -1,4 +1,4 @@
-"""Registries of what users and installed packages may add: kinds, quantities, noise stages, observations, terms, sources."""
+"""Registries of extensions by users and installed packages: kinds, quantities, noise stages, observations, terms, sources."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ Wrong = Callable[[object], str]  # returns why something is no such thing, or no
 
 
 class Registry(Generic[Thing]):
-    """Things of one sort: those of tgdsl, of installed packages by package and name, and registered ones.
+    """Extensions of one sort: tgdsl's, then installed packages' by package and name, then registered ones.
 
     Args:
-        group: Group of the entry points by which packages bring them.
-        what: What messages call one, "sensor kind".
-        plural: What messages call several, and the argument by which a caller gives some, "kinds".
-        own: Those of tgdsl.
+        group: Group of the packages' entry points.
+        what: Singular in messages, "sensor kind".
+        plural: Plural in messages, and the argument by which a caller passes some, "kinds".
+        own: tgdsl's things.
         wrong: Returns why something is no such thing, or nothing.
-        name_of: Returns the name of one.
+        name_of: Returns a thing's name.
     """
 
     def __init__(
@@ -45,28 +45,28 @@ class Registry(Generic[Thing]):
         """Make a thing known to all documents and artefacts that are read from now on.
 
         Raises:
-            TgdslError: If it is none, or another one has its name.
+            TgdslError: If it is no such thing, or another one has its name.
         """
         self._check(thing, "`register`")
-        before, self.registered = self.registered, (*self.registered, thing)
+        previous, self.registered = self.registered, (*self.registered, thing)
         try:
             self.by_name()
         except TgdslError:
-            self.registered = before
+            self.registered = previous
             raise
 
     def known(self, given: Sequence[Thing] = ()) -> tuple[Thing, ...]:
-        """Return all things: of tgdsl, of installed packages, registered and given ones.
+        """Return all things: tgdsl's, installed packages', registered and given ones.
 
-        An installed one that cannot be imported is left out, with a warning the first time. A thing may come in several ways.
+        An installed one that cannot be imported is left out, with a warning the first time. A thing may be listed repeatedly.
 
         Raises:
-            TgdslError: If two have one name, or one that is given is none.
+            TgdslError: If two things have one name, or a given one is no such thing.
         """
         return tuple(self.by_name(given).values())
 
     def by_name(self, given: Sequence[Thing] = ()) -> dict[str, Thing]:
-        """Return what `known` does, by name."""
+        """Return the things of `known`, by name."""
         result: dict[str, tuple[Any, str]] = {}
         for thing in given:
             self._check(thing, f"`{self.plural}`")
@@ -86,7 +86,7 @@ class Registry(Generic[Thing]):
 
 @cache
 def installed(group: str, what: str, wrong: Wrong) -> tuple[tuple[Any, str], ...]:
-    """Return what installed packages bring, and which package each is of."""
+    """Return the things of installed packages, each with its package."""
     results = []
     for point in sorted(entry_points(group=group), key=lambda point: (_package(point), point.name)):
         try:

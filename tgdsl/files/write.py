@@ -1,7 +1,7 @@
-"""Atomic writes: a file appears whole, or not at all, with the permissions of any new file; its folder; and what goes wrong.
+"""Atomic writes: a file appears whole, or not at all, with the permissions of any new file; and its folder.
 
-What is written goes to a temporary file beside the target, which then takes the target's place. What fails is a `FileError`
-that names the target.
+Content goes to a temporary file next to the target, which then replaces the target. Failures are a `FileError` that names the
+target.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from typing import IO
 
 from tgdsl.errors import FileError
 
-TEMPORARY = re.compile(r"\.[0-9a-f]{16}")  # stems of temporary files; one that is old was left by a process that was killed
+TEMPORARY = re.compile(r"\.[0-9a-f]{16}")  # stems of temporary files; an old one was left by a killed process
 
 
 def check_writable(target: Path) -> Path:
-    """See that a file can be written, before the work that leads to it; nothing is made, its folder neither.
+    """Check that a file can be written, before computing its content; neither the file nor its folder is created.
 
     Returns:
         The file.
@@ -40,7 +40,7 @@ def check_writable(target: Path) -> Path:
 
 
 def with_folder(target: Path) -> Path:
-    """Make the folder of a file that is written next; return the file."""
+    """Create the folder of a file; return the file."""
     with as_file_error(target):
         target.parent.mkdir(parents=True, exist_ok=True)
     return target
@@ -50,12 +50,12 @@ def with_folder(target: Path) -> Path:
 def atomic_path(target: Path) -> Iterator[Path]:
     """Yield an empty temporary file of the target's suffix, for a library that writes to a path; then it replaces the target.
 
-    If anything is raised meanwhile it is removed, and the target stays as it was.
+    After an exception it is removed, and the target stays unchanged.
     """
     temporary = target.with_name(f".{secrets.token_hex(8)}{target.suffix}")
     with as_file_error(target):
         _refuse_folder(target)
-        os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))  # less what the process's umask takes away
+        os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))  # the process's umask applies
         try:
             yield temporary
             os.replace(temporary, target)
@@ -72,22 +72,22 @@ def atomic_open(target: Path) -> Iterator[IO[bytes]]:
 
 
 def atomic_write(target: Path, content: bytes) -> None:
-    """Write a file; one that is there is replaced."""
+    """Write a file, replacing an existing one."""
     with atomic_open(target) as file:
         file.write(content)
 
 
 def atomic_write_all(contents: Mapping[Path, bytes]) -> None:
-    """Write files that belong together, and their folders: none takes its place before all are written, the last one last."""
+    """Write files that belong together, and their folders: all are written before they replace their targets in order."""
     with ExitStack() as stack:
-        for target, content in reversed(list(contents.items())):  # what was opened last is closed first
+        for target, content in reversed(list(contents.items())):  # the stack closes the last one first
             stack.enter_context(new_folder(target))
             stack.enter_context(atomic_path(target)).write_bytes(content)
 
 
 @contextmanager
 def as_file_error(target: Path) -> Iterator[None]:
-    """Have errors of the system name the file that the user asked for, whatever it is called meanwhile."""
+    """Raise the system's errors as errors of the requested file, not of its temporary one."""
     try:
         yield
     except FileError:
@@ -98,7 +98,7 @@ def as_file_error(target: Path) -> Iterator[None]:
 
 @contextmanager
 def new_folder(target: Path) -> Iterator[None]:
-    """Make the folder of a file; if anything is raised meanwhile, remove those folders that were not there and are empty."""
+    """Create the folder of a file; after an exception, remove new folders that are empty."""
     new = [folder for folder in target.parents if not folder.exists()]
     with_folder(target)
     try:

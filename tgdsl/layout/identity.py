@@ -1,13 +1,13 @@
 """Whether two tables of taxels are the same within rounding: by a comparison of tables, or of their ids.
 
-What learns from readings knows a taxel by its row alone, so that another order of rows is another input. Tables are the same if
-as many rows are on the same links and bodies, in the same cells, at the same places: to within `POSITION` for positions and
-radii, `DIRECTION` for normals and tangents, `AREA` for areas. Vertices that went through float32 are 1e-8 m away, two taxels of
-a hand at least some 1e-4 m apart.
+A policy knows a taxel only by its row: another order of rows is another input. Tables are the same if they have equally many
+rows, on the same links and bodies, in the same cells, at the same places: to within `POSITION` for positions and radii,
+`DIRECTION` for normals and tangents, `AREA` for areas. Float32 moves vertices by 1e-8 m; a hand's taxels are at least about
+1e-4 m apart.
 
-An id is coarser: it is of links, rows and cells, of the interval of 1 mm in which a length is, and of that of 0.1 in which a
-component of a direction is. It has a half for each of two grids, half an interval apart, and is the same if either half is: a
-number that rounding takes across a line of one grid is in the middle of an interval of the other.
+An id is coarser: it hashes links, rows and cells, lengths rounded to intervals of 1 mm, and components of directions rounded to
+intervals of 0.1. It has one half for each of two grids, half an interval apart, and matches if either half matches: a number
+that rounding moves across a line of one grid is in the middle of an interval of the other.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ DIRECTION = 1e-4  # largest distance of two unit vectors that are the same direc
 AREA = 0.05  # largest difference of two areas that are the same, relative to the larger: sampled ones are counted in points
 _LENGTH_CELL, _DIRECTION_CELL = 1e-3, 0.1
 _SHIFTS = (0.5 * np.sqrt(0.3), 0.5 * np.sqrt(0.3) + 0.5)
-"""Where the grids of ids begin, in cells: numbers that people draw, such as halves of a millimetre, are on no line."""
+"""Offsets of the ids' grids, in cells: round numbers, such as halves of a millimetre, are on no line."""
 REQUIRED = ("link", "body", "pos", "normal")
 COMPARED = (*REQUIRED, "tangent", "radius", "area", "row", "column")
 _TOLERANCES = {"pos": POSITION, "normal": DIRECTION, "tangent": DIRECTION, "radius": POSITION, "area": AREA}
@@ -52,8 +52,8 @@ def is_same_id(one: str, other: str) -> bool:
 def _grid_digest(layout: Layout, names: str, shift: float) -> str:
     digest = hashlib.sha256(names.encode())
     lengths, directions = (layout.pos, layout.radius), (layout.normal, layout.tangent)
-    numbers = [*(own / _LENGTH_CELL for own in lengths), *(own / _DIRECTION_CELL for own in directions)]
-    for array in (layout.link_id, layout.cell, *(np.floor(own + shift) for own in numbers)):
+    numbers = [*(length / _LENGTH_CELL for length in lengths), *(part / _DIRECTION_CELL for part in directions)]
+    for array in (layout.link_id, layout.cell, *(np.floor(number + shift) for number in numbers)):
         digest.update(f"{array.shape} ".encode() + array.astype("<i8").tobytes())
     return digest.hexdigest()[:16]
 
@@ -67,10 +67,10 @@ def columns_of(layout: Layout) -> dict[str, np.ndarray]:
 
 
 def check_same_rows(here: Columns, there: Columns, what: str) -> None:
-    """Refuse a table that is in use, `here`, if some row is not that of the expected one, `there`.
+    """Refuse a table in use, `here`, if a row differs from the expected table's, `there`.
 
     Raises:
-        TaxelError: How they differ: how many rows, and the first one that does, here and there.
+        TaxelError: How they differ: the number of rows, and the first differing row, here and there.
     """
     num_here, num_there = len(here["pos"]), len(there["pos"])
     num = min(num_here, num_there)
@@ -84,7 +84,7 @@ def check_same_rows(here: Columns, there: Columns, what: str) -> None:
         text += ", the same ones in another order" if _places(here) == _places(there) else ""
     if not is_same.all():
         row = int(np.argmin(is_same))
-        text += f"; the first is row {row}: {_shown(here, there, row)} here, {_shown(there, here, row)} expected"
+        text += f"; the first is row {row}: {_described(here, there, row)} here, {_described(there, here, row)} expected"
     raise TaxelError(f"{what}: {text}")
 
 
@@ -94,7 +94,7 @@ def _same_rows(here: Columns, there: Columns, num: int) -> Bool[np.ndarray, " ro
 
 
 def _same(name: str, here: Shaped[np.ndarray, "row ..."], there: Shaped[np.ndarray, "row ..."]) -> Bool[np.ndarray, " row"]:
-    """Return in which rows a column is the same."""
+    """Return the rows in which a column is the same."""
     if name not in _TOLERANCES:
         return np.asarray(here == there)
     one, other = (np.asarray(values, dtype=np.float64).reshape(len(here), -1) for values in (here, there))
@@ -107,8 +107,8 @@ def _places(table: Columns) -> list[tuple[Any, ...]]:
     return sorted((str(link), *pos) for link, pos in zip(table["link"], rounded.tolist(), strict=True))
 
 
-def _shown(table: Columns, other: Columns, row: int) -> str:
-    """Return a row as a message says it: its link and place, and what tells it from the other table's if these do not."""
+def _described(table: Columns, other: Columns, row: int) -> str:
+    """Return a row as text: its link and place, and if these agree with the other table's, the columns that differ."""
     place = ", ".join(f"{1e3 * x:.6g}" for x in table["pos"][row])
     text = f'link "{table["link"][row]}" at [{place}] mm'
     shared = [name for name in COMPARED if name in table and name in other]

@@ -1,4 +1,4 @@
-"""The Layout: what a spec means on one robot at one resolution. NumPy, float64, one row per taxel.
+"""The Layout: the taxels of a spec on one robot at one resolution. NumPy, float64, one row per taxel.
 
 Shapes: `taxel` rows, sorted by link; every position and direction is in the frame of the taxel's body.
 """
@@ -37,9 +37,9 @@ class Layout:
     @staticmethod
     def of_links(links: tuple[Link, ...], groups: Mapping[str, tuple[str, ...]]) -> Layout:
         """Return the layout of links that carry no taxels, for sensors that have a place on each link."""
-        none, kept = np.zeros((0, 3)), _groups_of(links, groups)
+        none, link_groups = np.zeros((0, 3)), _groups_of(links, groups)
         no_cells = np.zeros((0, 2), dtype=np.int64)
-        return Layout(links, kept, np.zeros(0, dtype=np.int64), none, none, none, none[:, 0], none[:, 0], no_cells)
+        return Layout(links, link_groups, np.zeros(0, dtype=np.int64), none, none, none, none[:, 0], none[:, 0], no_cells)
 
     @property
     def bodies(self) -> tuple[str, ...]:
@@ -63,8 +63,8 @@ class Layout:
 
     def taxels_of(self, names: tuple[str, ...]) -> Int[np.ndarray, " chosen"]:
         """Return the taxel indices of some links, ascending."""
-        wanted = np.array([link.name in set(names) for link in self.links], dtype=bool)
-        return np.flatnonzero(wanted[self.link_id]).astype(np.int64)
+        is_requested = np.array([link.name in set(names) for link in self.links], dtype=bool)
+        return np.flatnonzero(is_requested[self.link_id]).astype(np.int64)
 
     def take(self, taxels: Int[np.ndarray, " chosen"]) -> Layout:
         """Return the layout of some taxels, with only the links that carry them."""
@@ -78,21 +78,21 @@ class Layout:
 
 def _groups_of(links: Sequence[Link], groups: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
     names = {link.name for link in links}
-    kept = {group: tuple(name for name in members if name in names) for group, members in groups.items()}
-    return {group: members for group, members in kept.items() if members}
+    remaining = {group: tuple(name for name in members if name in names) for group, members in groups.items()}
+    return {group: members for group, members in remaining.items() if members}
 
 
 REASONS = NOT_COLLIDED, BURIED, COVERED = "not collided", "buried", "covered at rest"
-"""Why a taxel cannot feel; of several reasons that hold the first counts."""
+"""Why a taxel cannot sense; of several reasons the first counts."""
 
 
 @dataclass(frozen=True, eq=False)
 class Unfelt:
-    """Taxels of a link that cannot feel, all for one reason."""
+    """Taxels of a link that cannot sense, all for one reason."""
 
     link: str  # the link
     reason: str  # one of the reasons above
-    why: str  # what the reason is here
+    why: str  # the reason in words
     taxels: Int[np.ndarray, " unfelt"]  # the taxels, by their indices in the layout, ascending
     of: int  # number of taxels of the link
 
@@ -100,12 +100,12 @@ class Unfelt:
         return f"{self.link}: {len(self.taxels)} of {self.of} taxels {self.why}"
 
 
-def by_reason(found: Sequence[Unfelt]) -> str:
-    """Return how many taxels cannot feel for which reason: "buried 12, covered at rest 3"."""
-    counts = {reason: sum(len(own.taxels) for own in found if own.reason == reason) for reason in REASONS}
+def by_reason(records: Sequence[Unfelt]) -> str:
+    """Return the number of taxels that cannot sense for each reason: "buried 12, covered at rest 3"."""
+    counts = {reason: sum(len(record.taxels) for record in records if record.reason == reason) for reason in REASONS}
     return ", ".join(f"{reason} {count}" for reason, count in counts.items() if count)
 
 
-def unfelt_ids(found: Sequence[Unfelt]) -> Int[np.ndarray, " unfelt"]:
-    """Return the taxels that cannot feel, ascending."""
-    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(own.taxels for own in found)]))
+def unfelt_ids(records: Sequence[Unfelt]) -> Int[np.ndarray, " unfelt"]:
+    """Return the indices of the taxels that cannot sense, ascending."""
+    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(record.taxels for record in records)]))
