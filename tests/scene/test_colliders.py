@@ -89,8 +89,8 @@ def test_an_empty_list_changes_nothing():
     [
         (
             {"ball": 'contype="0" conaffinity="1"'},
-            'geom "ball" (body "ball") collides with "one" by its `conaffinity` alone; primitive colliders meet what has one'
-            " of their bits in its `contype`",
+            'geom "ball" (body "ball") collides with "one" by its `conaffinity` alone; primitive colliders collide only with geoms'
+            " whose `contype` has one of their bits",
         ),
         (
             {"more": '<contact><pair geom1="one" geom2="ball"/></contact>'},

@@ -95,6 +95,6 @@ def test_a_step_s_are_told_once_each_whatever_their_numbers():
         )
         told.tell(["Pre-allocated constraint buffer is full (13). Time = 0.2000.\n\n", "Another thing. Time = 1e-3."])
     assert [str(w.message) for w in caught] == [
-        "MuJoCo: Pre-allocated constraint buffer is full (12). Time = 0.1000.; this is said once",
-        "MuJoCo: Another thing. Time = 1e-3.; this is said once",
+        "MuJoCo: Pre-allocated constraint buffer is full (12). Time = 0.1000.; shown once",
+        "MuJoCo: Another thing. Time = 1e-3.; shown once",
     ]

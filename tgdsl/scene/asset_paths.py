@@ -69,7 +69,7 @@ def _check_key(key: str, endings: tuple[str, ...]) -> None:
 
 
 def _wrong_path(path: str) -> str:
-    """Return why a path cannot be that of an asset, or nothing."""
+    """Return why a path cannot be an asset's, or nothing."""
     inside = path.removeprefix(ROBOTS)
     is_own = inside != path
     if "\\" in path or "\0" in path:
@@ -84,7 +84,7 @@ def _wrong_path(path: str) -> str:
 
 
 def _check_text(text: str, parts: set[str], assets: set[str]) -> None:
-    """Refuse a text that names other files than those that the artefact lists."""
+    """Refuse a text that names files which the artefact does not list."""
     if "<!DOCTYPE" in text:
         raise ArtifactError("the scene's text has a DOCTYPE, which MJCF has not")
     try:
@@ -92,9 +92,9 @@ def _check_text(text: str, parts: set[str], assets: set[str]) -> None:
     except (ET.ParseError, ValueError) as error:
         raise ArtifactError(f"the scene's text is not XML: {error}") from error
     for element in root.iter():
-        known = parts if element.tag in ("include", "model") else assets
+        keys = parts if element.tag in ("include", "model") else assets
         for name, value in element.attrib.items():
-            if name.startswith("file") and value not in known:
+            if name.startswith("file") and value not in keys:
                 raise ArtifactError(f'the scene\'s text names the file "{value}", which the artefact does not list')
             if name in FOLDER_ATTRIBUTES:
                 raise ArtifactError(f"the scene's text names the folder \"{value}\"; an artefact's files have none")

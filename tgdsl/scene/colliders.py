@@ -1,8 +1,8 @@
-"""Primitive colliders in place of the robot's own geoms, which are then only seen: `robot: {collision: primitive}`.
+"""Primitive colliders that replace the robot's geoms, which stay visible: `robot: {collision: primitive}`.
 
-Of a link with several colliders one or more are its *core*. Links that have colliders meet each other by their cores alone,
-whatever else is in the scene meets all of them: so the pairs of geoms that a simulator looks at are those of the links' number,
-and only where objects touch the surface counts what the other colliders add.
+One or more colliders of a link are its *core*. Links with colliders collide with each other by their cores alone, and with
+the rest of the scene by all colliders. So the number of geom pairs grows with the number of links, and the other colliders
+refine contacts with objects only.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def meets(contype: int, conaffinity: int, geom: mujoco.MjsGeom) -> bool:
     return bool((contype & geom.conaffinity) | (geom.contype & conaffinity))
 
 
-GROUP = 3  # MuJoCo's group of colliders: its viewers do not show it unless they are told to
+GROUP = 3  # MuJoCo's group of colliders, which its viewers hide by default
 
 
 def collider_name(body: str, i: int) -> str:
@@ -53,14 +53,14 @@ def collider_name(body: str, i: int) -> str:
 
 
 def with_colliders(spec: mujoco.MjSpec, colliders: Sequence[Collider]) -> mujoco.MjSpec:
-    """Give links colliders in place of those of their geoms that collide: the spec is changed in place and returned.
+    """Replace the colliding geoms of links by colliders; the spec is changed in place and returned.
 
-    These stay, to be seen. Masses and inertias are not changed. What a geom in contact is besides its shape, such as friction,
-    a link's colliders have of the first of them.
+    The geoms stay visible. Masses and inertias do not change. A link's colliders copy contact parameters, such as friction,
+    from its first colliding geom.
 
     Raises:
-        RobotError: If the scene lacks a body, or one has no geom that collides; if what a link shall go on meeting meets it by
-            `contype` of the link's geoms alone, or by an explicit pair of geoms.
+        RobotError: If the scene lacks a body, or one has no geom that collides; if another geom collides with a link only by
+            the `contype` of the link's geoms, or by an explicit pair of geoms.
     """
     by_body: dict[str, list[Collider]] = {}
     for collider in colliders:
@@ -70,11 +70,11 @@ def with_colliders(spec: mujoco.MjSpec, colliders: Sequence[Collider]) -> mujoco
     geoms_of = {body: _colliding(spec, body) for body in by_body}
     replaced = [geom for geoms in geoms_of.values() for geom in geoms]
     _refuse_pairs(spec, replaced)
-    others = [geom for geom in spec.geoms if geom not in replaced]
+    rest = [geom for geom in spec.geoms if geom not in replaced]
     is_self_colliding = any(meets(one.contype, one.conaffinity, other) for one in replaced for other in replaced)
     core = free_bit(spec, "links with primitive colliders", RobotError, ("contype", "conaffinity")) if is_self_colliding else 0
     for body, parts in by_body.items():
-        _refuse_lost(body, geoms_of[body], others)
+        _refuse_lost(body, geoms_of[body], rest)
         for i, collider in enumerate(parts):
             _add(spec, collider, i, geoms_of[body][0], core if collider.is_core else 0)
     for geom in replaced:
@@ -101,12 +101,12 @@ def _refuse_pairs(spec: mujoco.MjSpec, replaced: Sequence[mujoco.MjsGeom]) -> No
 
 
 def _refuse_lost(body: str, replaced: Sequence[mujoco.MjsGeom], others: Sequence[mujoco.MjsGeom]) -> None:
-    """Refuse a scene where something meets a link only because of its `contype`, which its colliders do not have."""
+    """Refuse a scene where a geom collides with a link only by the link's `contype`, which its colliders do not have."""
     for other in others:
-        met = any(meets(own.contype, own.conaffinity, other) for own in replaced)
+        met = any(meets(geom.contype, geom.conaffinity, other) for geom in replaced)
         if met and not meets(0, replaced[0].conaffinity, other):
             problem = f'geom "{other.name}" (body "{other.parent.name}") collides with "{body}" by its `conaffinity` alone'
-            raise RobotError(f"{problem}; primitive colliders meet what has one of their bits in its `contype`")
+            raise RobotError(f"{problem}; primitive colliders collide only with geoms whose `contype` has one of their bits")
 
 
 def _add(spec: mujoco.MjSpec, collider: Collider, i: int, like: mujoco.MjsGeom, core: int) -> None:

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 
 PATH_FIELDS = frozenset({"paths", "npaths", "mesh_pathadr", "hfield_pathadr", "skin_pathadr", "tex_pathadr", "nbuffer"})
-"""Where files were found, and the size of the memory that holds this too: a kept scene names its files by content."""
+"""Fields of file paths, and the buffer size that includes them: an artefact's scene names its files by content."""
 ROUNDED = 1e-4  # relative error of numbers that MuJoCo computes of an MJCF text that it wrote itself, with six digits
-TINY = 1e-6  # absolute error of those that are differences of such numbers, in SI units
+TINY = 1e-6  # absolute error of differences of such numbers, in SI units
 ROUNDING_SENSITIVE = (
     "bvh_",
     "body_bvh",

@@ -1,7 +1,7 @@
-"""What MuJoCo warns of: one Python warning a message with the file named, nothing printed, no MUJOCO_LOG.TXT.
+"""MuJoCo's warnings as Python warnings: one per message, with the file's name; no output and no MUJOCO_LOG.TXT.
 
-MuJoCo tells in two ways: through its C library, which would print and log, from any thread; and as Python warnings. A Python
-exception in the former's callback ends the process, so messages are collected first and told when MuJoCo is done.
+MuJoCo warns in two ways: from its C library, which would print and log, on any thread; and as Python warnings. A Python
+exception in the C library's callback ends the process, so messages are collected and raised as warnings afterwards.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from contextlib import contextmanager
 import mujoco
 
 IRRELEVANT = "Attaching a spec with an empty prefix"
-"""A robot attached under its own names is just what a scene of ours wants, and scenes are never saved by MuJoCo."""
+"""Our scenes attach robots under their own names on purpose, and MuJoCo never saves these scenes."""
 
-DIVERGENCE = "Nan, Inf or huge value in"  # how messages begin of values that simulators look at themselves
+DIVERGENCE = "Nan, Inf or huge value in"  # prefix of messages about divergence, which simulators detect themselves
 
 
 @contextmanager
 def collected_messages() -> Iterator[list[str]]:
     """Collect what MuJoCo's C library would print and log."""
-    before, messages = mujoco.get_mju_user_warning(), list[str]()
+    previous, messages = mujoco.get_mju_user_warning(), list[str]()
     mujoco.set_mju_user_warning(messages.append)
     try:
         yield messages
     finally:
-        mujoco.set_mju_user_warning(before)
+        mujoco.set_mju_user_warning(previous)
 
 
 @contextmanager
@@ -39,18 +39,18 @@ def muted_mujoco() -> Iterator[None]:
 
 @contextmanager
 def told_of(file: object, stacklevel: int = 4) -> Iterator[None]:
-    """Warn once of each thing that MuJoCo warns of while it reads a model, when it has done; of what fails, the error tells.
+    """Repeat each different warning of MuJoCo's model reader once at the end; if reading fails, there is only the error.
 
     Args:
-        file: What each warning names first, unless it does so already, as those of readers of ours do.
+        file: Name that begins each warning; warnings of our own readers begin with it already.
         stacklevel: As for `warnings.warn`, counted from here.
     """
     with collected_messages() as messages, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         yield
-    told = [(_named(message, file), UserWarning) for message in messages]
-    told += [(_named(str(w.message), file) if w.category is UserWarning else str(w.message), w.category) for w in caught]
-    for text, category in dict.fromkeys(told):
+    texts = [(_named(message, file), UserWarning) for message in messages]
+    texts += [(_named(str(w.message), file) if w.category is UserWarning else str(w.message), w.category) for w in caught]
+    for text, category in dict.fromkeys(texts):
         if IRRELEVANT not in text:
             warnings.warn(text, category, stacklevel=stacklevel)
 
@@ -60,15 +60,15 @@ def _named(message: str, file: object) -> str:
 
 
 class StepWarnings:
-    """What MuJoCo warns of while it steps: each thing is told once, and of divergence nothing, of which faults tell."""
+    """MuJoCo's warnings while it steps: one per kind of message, none about divergence, which `EnvFaults` reports."""
 
     def __init__(self) -> None:
         self._told: set[str] = set()
 
     def tell(self, messages: Sequence[str]) -> None:
-        """Warn of what is new."""
+        """Warn of new kinds of messages."""
         for message in messages:
-            kind = re.sub(r"\d[\d.e+-]*", "", message)  # without the instant and the numbers of what it is about
+            kind = re.sub(r"\d[\d.e+-]*", "", message)  # without time and element numbers
             if kind not in self._told and DIVERGENCE not in message:
                 self._told.add(kind)
-                warnings.warn(f"MuJoCo: {' '.join(message.split())}; this is said once", stacklevel=5)
+                warnings.warn(f"MuJoCo: {' '.join(message.split())}; shown once", stacklevel=5)

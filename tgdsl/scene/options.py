@@ -43,10 +43,10 @@ def set_options(spec: mujoco.MjSpec, options: Options) -> None:
         SimulationError: If there is no such option or keyword, or a value does not fit, as MuJoCo would silently take another.
     """
     option, torques = spec.option, dict[str, Any](options).get("max_torque", {})
-    options = {name: given for name, given in options.items() if name != "max_torque"}
-    values = {name: _value(option, name, given) for name, given in options.items() if name not in CONTACTS}
+    options = {name: value for name, value in options.items() if name != "max_torque"}
+    values = {name: _value(option, name, value) for name, value in options.items() if name not in CONTACTS}
     steps = float(values.get("timestep", option.timestep)), int(values.get("disableflags", option.disableflags))
-    contacts = {name: _contact(name, given, *steps) for name, given in options.items() if name in CONTACTS}
+    contacts = {name: _contact(name, value, *steps) for name, value in options.items() if name in CONTACTS}
     for name, value in values.items():
         setattr(option, name, value)
     for name, value in contacts.items():
@@ -82,9 +82,9 @@ def _contact(name: str, given: Any, timestep: float, disabled: int) -> list[floa
 
 def _value(option: Any, name: str, given: Any) -> Any:
     """Return the value of an option as MuJoCo has it."""
-    known = (*OPTION_NAMES, *CONTACTS)
-    if name not in known:
-        raise SimulationError(f'MuJoCo has no option "{name}"; {did_you_mean(name, known, "options")}')
+    names = (*OPTION_NAMES, *CONTACTS)
+    if name not in names:
+        raise SimulationError(f'MuJoCo has no option "{name}"; {did_you_mean(name, names, "options")}')
     if name in KEYWORDS:
         return _keyword(name, given)
     now = getattr(option, name)
@@ -107,10 +107,10 @@ def _value(option: Any, name: str, given: Any) -> Any:
 
 def _keyword(name: str, given: Any) -> int:
     """Return the number of a keyword, which may be given as that number."""
-    known = {member.name.partition("_")[2].lower(): int(member) for member in KEYWORDS[name].__members__.values()}
-    if isinstance(given, str) and given.lower() in known:
-        return known[given.lower()]
-    if not isinstance(given, str) and np.ndim(given) == 0 and given in known.values():
+    numbers = {member.name.partition("_")[2].lower(): int(member) for member in KEYWORDS[name].__members__.values()}
+    if isinstance(given, str) and given.lower() in numbers:
+        return numbers[given.lower()]
+    if not isinstance(given, str) and np.ndim(given) == 0 and given in numbers.values():
         return int(given)
-    shown = f'"{given}"' if isinstance(given, str) else repr(given)
-    raise SimulationError(f"option {name} is {shown}; {did_you_mean(str(given).lower(), known, 'values')}")
+    text = f'"{given}"' if isinstance(given, str) else repr(given)
+    raise SimulationError(f"option {name} is {text}; {did_you_mean(str(given).lower(), numbers, 'values')}")

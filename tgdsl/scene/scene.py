@@ -103,7 +103,7 @@ def num_objects(content: bytes) -> int:
 
 
 def scene_model(scene: SceneFile) -> mujoco.MjModel:
-    """Return the compiled model of a scene, its assets read from where they were found; objects have their first variant.
+    """Return the compiled model of a scene with the first variant of each object; assets are read from their recorded paths.
 
     Raises:
         ArtifactError: If an asset is missing or is not the one that the scene was compiled with.
@@ -113,19 +113,18 @@ def scene_model(scene: SceneFile) -> mujoco.MjModel:
 
 @dataclass(frozen=True)
 class Choice:
-    """What an object is like in one environment."""
+    """An object's variant and size in one environment."""
 
-    variant: int = 0  # which of its variants it has
-    size: tuple[float, float, float] | None = None  # its size as MuJoCo defines it [m]; None: as the scene or the variant says
+    variant: int = 0  # index of its variant
+    size: tuple[float, float, float] | None = None  # its size as MuJoCo defines it [m]; None: the scene's or the variant's
 
 
 def with_choices(spec: mujoco.MjSpec, objects: Sequence[SceneObject], choices: Mapping[str, Choice]) -> mujoco.MjSpec:
     """Give objects the geoms of one variant each: the spec is changed in place and returned.
 
-    Bodies that are welded to an object's body lose theirs. Whatever is chosen, the same geoms and meshes are there, so that
-    MuJoCo lays its data out alike: those that a variant lacks weigh nothing, are not seen, and collide only with what has a bit
-    of `conaffinity` that nothing has. A custom number of each geom's says whether it is lacking: its looks, which are the
-    template's, do not. Bodies whose inertia the scene does not give have that of their own geoms.
+    Bodies welded to an object's body lose their geoms. All choices have the same geoms and meshes, so that MuJoCo's data layout
+    is the same. Geoms absent from a variant weigh nothing, are invisible, and need a bit of `conaffinity` that no geom has. A
+    custom number marks absent geoms. Bodies without inertia in the scene get their geoms' inertia.
     """
     new = {target.body for target in objects if spec.geom(placeholder_name(target.body)) is not None}
     weighed = new | {target.body for target in objects if target.types and not spec.body(target.body).explicitinertial}
@@ -174,15 +173,15 @@ def _absence(name: str) -> str:
 
 
 def _add_geom(spec: mujoco.MjSpec, target: SceneObject, i: int, variant: int, template: mujoco.MjsGeom) -> None:
-    """Add geom i of an object to its body as one variant has it, and the meshes that it has in any."""
+    """Add one variant's geom i of an object to its body, and the meshes of this geom in all variants."""
     meshes = {}
     for v, geoms in enumerate(target.variants):
         shape = geoms[i]
         if shape is not None and shape.mesh:
             meshes[v] = f"tgdsl/{target.name}/{v}/{i}"
             spec.add_mesh(name=meshes[v], file=shape.mesh, scale=[shape.scale] * 3)
-    chosen = target.variants[variant][i]
-    like = chosen or next(geoms[i] for geoms in target.variants if geoms[i] is not None)
+    source = target.variants[variant][i]
+    like = source or next(geoms[i] for geoms in target.variants if geoms[i] is not None)
     assert isinstance(like, SceneGeom)
     geom = spec.body(target.body).add_geom(
         name=geom_name(target, i),
@@ -198,8 +197,8 @@ def _add_geom(spec: mujoco.MjSpec, target: SceneObject, i: int, variant: int, te
         geom.meshname = meshes.get(variant, next(iter(meshes.values())))
     for name in INHERITED:
         setattr(geom, name, getattr(template, name))
-    spec.add_numeric(name=_absence(geom.name), data=[float(chosen is None)])
-    if chosen is None:
+    spec.add_numeric(name=_absence(geom.name), data=[float(source is None)])
+    if source is None:
         geom.contype, geom.conaffinity = free_bit(spec, "objects that vary", RobotError), 0
         geom.mass, geom.density = 0.0, 0.0
         geom.rgba = [0.0, 0.0, 0.0, 0.0]
@@ -222,9 +221,9 @@ class SceneModels:
         self._models: dict[tuple[Choice, ...], mujoco.MjModel] = {}
         self._off_center: tuple[str, ...] = ()
         for target in scene.objects:
-            own = [self.model({target.name: Choice(v)}) for v in range(len(target.variants))]
-            # MuJoCo stores less of a body whose centre of mass is its origin.
-            if len({(model.nC, model.nM, model.nD, model.nB) for model in own}) > 1:
+            models = [self.model({target.name: Choice(v)}) for v in range(len(target.variants))]
+            # MuJoCo stores less for a body whose centre of mass is its origin.
+            if len({(model.nC, model.nM, model.nD, model.nB) for model in models}) > 1:
                 self._off_center += (target.body,)
         if self._off_center:
             self._models.clear()
@@ -245,7 +244,7 @@ class SceneModels:
         return self._models[key]
 
     def models(self, choices: Sequence[Mapping[str, Choice]]) -> list[mujoco.MjModel]:
-        """Return the model of each environment, and forget those that none has: sizes redrawn would pile up."""
+        """Return the model of each environment, and drop unused ones: new sizes would accumulate models."""
         results = [self.model(choice) for choice in choices]
         used = {id(model) for model in results}
         self._models = {key: model for key, model in self._models.items() if id(model) in used}
