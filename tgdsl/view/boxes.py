@@ -32,24 +32,24 @@ FLAT = 0.5  # half of the range of the colours where all that is read is the sam
 class Boxes:
     """The boxes of one reading in one environment, and what they read."""
 
-    layout: Layout  # those at the surface of their link, as taxels: centre, mean normal and area of what is exposed
-    chosen: Int[Array, " shown"]  # which boxes these are: the others are hidden inside
+    layout: Layout  # boxes at the surface of their link, as taxels: centre, mean normal and area of the exposed faces
+    chosen: Int[Array, " shown"]  # indices of these boxes: the others are inside
     size: Float[Array, "shown 3"]  # their sides, along the axes of their body [m]
-    value: Float[Array, " box"]  # what each reads, hidden ones too
+    value: Float[Array, " box"]  # reading of each box, hidden ones too
     label: str  # quantity and unit
     unit: str  # as it is printed
-    ends: tuple[float, float] | None = None  # lowest and highest of the colours; None: those of the values
+    ends: tuple[float, float] | None = None  # lowest and highest value of the colours; None: of the readings
 
     @property
     def norm(self) -> Normalize:
-        """The range of the colours: as it was asked for, or one that holds all values."""
+        """The range of the colours: `ends`, or one that holds all values."""
         if self.ends is not None:
             return Normalize(*self.ends, clip=True)
         return norm_between(float(self.value.min()), float(self.value.max()))
 
     @property
     def headline(self) -> str:
-        """The range of what is read: `temperature 22.00 … 24.13 °C`, or one number where all are the same."""
+        """The range of the readings: `temperature 22.00 … 24.13 °C`, or one number where all are equal."""
         ends = dict.fromkeys(f"{end:.2f}" for end in (self.value.min(), self.value.max()))
         return f"{self.label.split(' [')[0]} {' … '.join(ends)} {self.unit}"
 
@@ -97,7 +97,7 @@ def boxes_of(
 ) -> Boxes:
     """Return the boxes of a reading (see `is_boxed`) in one environment, and what they read; of stacked calls the last one.
 
-    `temperatures`: lowest and highest of the colours of temperatures [°C]; default: those that are read.
+    `temperatures`: lowest and highest temperature of the colours [°C]; default: of the readings.
     """
     table, links = touch.rows[output.name], touch.plan.sensor_of(output.name).links
     key = "link" if "link" in (table.dtype.names or ()) else "body"
@@ -105,15 +105,15 @@ def boxes_of(
     link_id = np.array([names.index(name) for name in table[key]], dtype=np.int64)
     pos, size = table["pos"], table["size"]
     exposed = _exposed(link_id, pos, size)
-    chosen = np.flatnonzero((exposed > 0).any(axis=(1, 2)))
-    exposed, link_id, pos = exposed[chosen], link_id[chosen], pos[chosen]
+    visible = np.flatnonzero((exposed > 0).any(axis=(1, 2)))
+    exposed, link_id, pos = exposed[visible], link_id[visible], pos[visible]
     area = exposed.sum(axis=(1, 2))
-    normal = (exposed[:, 1] - exposed[:, 0]) / area[:, None]  # shorter than 1 at edges, so that those of a whole box cancel
+    normal = (exposed[:, 1] - exposed[:, 0]) / area[:, None]  # shorter than 1 at edges, zero for a box with all faces exposed
     unit = "°C" if output.units[0] == "degC" else output.units[0]
     tangent = np.roll(normal, 1, axis=1)
     layout = Layout(links, {}, link_id, pos, normal, tangent, np.sqrt(area), area, np.full((len(area), 2), -1))
     ends = temperatures if unit == "°C" else None
-    return Boxes(layout, chosen, size[chosen], read_now(values, env)[:, 0], f"{output.channels[0]} [{unit}]", unit, ends)
+    return Boxes(layout, visible, size[visible], read_now(values, env)[:, 0], f"{output.channels[0]} [{unit}]", unit, ends)
 
 
 def _exposed(link_id: Int[Array, " box"], pos: Float[Array, "box 3"], size: Float[Array, "box 3"]) -> Float[Array, "box 2 3"]:
@@ -121,10 +121,10 @@ def _exposed(link_id: Int[Array, " box"], pos: Float[Array, "box 3"], size: Floa
     result = np.zeros((len(pos), 2, 3))
     area = size.prod(axis=1, keepdims=True) / size
     for link in np.unique(link_id):
-        own = link_id == link
-        low, high, slack = pos[own] - 0.5 * size[own], pos[own] + 0.5 * size[own], 0.1 * size[own]
-        result[own, 0] = area[own] * (low < low.min(axis=0) + slack)
-        result[own, 1] = area[own] * (high > high.max(axis=0) - slack)
+        members = link_id == link
+        low, high, slack = pos[members] - 0.5 * size[members], pos[members] + 0.5 * size[members], 0.1 * size[members]
+        result[members, 0] = area[members] * (low < low.min(axis=0) + slack)
+        result[members, 1] = area[members] * (high > high.max(axis=0) - slack)
     return result
 
 

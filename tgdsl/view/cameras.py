@@ -1,4 +1,4 @@
-"""From where a hand is seen: views by name or angle, and the one that shows most.
+"""Cameras of a hand's pictures: views by name or angle, and the view that shows most.
 
 Shapes: `taxel` taxels of one sensor or layout.
 """
@@ -30,13 +30,13 @@ VIEWS = {
 }
 # length of the mean unit normal below which taxels have no common side, but look at each other, as a gripper's pads do
 OPPOSED = 0.2
-_PAST_NEAR_PAD = np.radians(35.0)  # how far a camera turns from beside opposed pads towards the face of one
+_PAST_NEAR_PAD = np.radians(35.0)  # angle between the camera and the plane of opposed pads, so that one pad's face shows
 _CANDIDATES = (*VIEWS, *(f"{around},{rise}" for rise in (-30, 16, 50) for around in range(0, 360, 45)))
 _LOOK = 200  # columns and rows of the pictures by which views are compared
 
 
 class ViewError(TgdslError):
-    """A picture that cannot be drawn of what was given."""
+    """A picture that cannot be drawn from its arguments."""
 
 
 def angles_of(view: str) -> tuple[float, float]:
@@ -68,11 +68,11 @@ def pose_of(model: mujoco.MjModel, keyframe: str | None) -> Pose:
 
 
 def camera_of(view: str, model: mujoco.MjModel, layouts: Sequence[Layout], pose: Pose, root: int) -> Camera:
-    """Return the camera of a view: it is fixed to the hand's first body, so that a hand that closes is seen from the same side.
+    """Return the camera of a view: fixed to the hand's first body, so that a closing hand keeps its side to the camera.
 
-    Up is an axis of the root's frame: the one along which the taxels lie farthest from its origin, of those not pointing at
-    the camera. Where taxels are opposed, up is against gravity, and the camera stands beside the gap that they close, turned so
-    far that one side's faces show. Taxels count in the model's initial state, each by the surface that it stands for.
+    Up is the axis of the root's frame along which the taxels lie farthest from its origin, among axes not pointing at the
+    camera. For opposed taxels up is against gravity, and the camera looks across the gap between them, rotated until one side's
+    faces show. Taxels count in the model's initial state, weighted by area.
     """
     initial = pose_of(model, None)
     taxels = [taxels_of(model, initial, layout) for layout in layouts]
@@ -122,28 +122,28 @@ def facing_camera(markers: Markers, origin: Float[Array, " 3"]) -> Camera:
 def best_camera(markers: Markers, hand: Mesh, model: mujoco.MjModel, layout: Layout, pose: Pose, root: int) -> Camera:
     """Return the camera that those taxels face which read most (see `facing_camera`), or the one that shows most taxels.
 
-    Taxels count that are touched, or all where none is. The first camera is kept if it shows half as many as any other or more;
+    It counts touched taxels, or all if none is touched. The first camera wins if it shows at least half as many as any other;
     it is `front` where the taxels are opposed. `hand` hides taxels; `layout` has the taxels that views are named after.
     """
-    wanted = markers.is_touched if markers.is_touched.any() else markers.size > 0
+    targets = markers.is_touched if markers.is_touched.any() else markers.size > 0
     weight = markers.value if markers.is_read.any() else np.ones(len(markers.value))
     is_opposed = np.linalg.norm(weight @ markers.normal) < OPPOSED * weight.sum()
     first = camera_of("front", model, [layout], pose, root) if is_opposed else facing_camera(markers, pose.pos[root])
-    own, _ = _shown(markers, wanted, hand, first)
-    if 2 * own >= wanted.sum():
+    num_seen, _ = _count_visible(markers, targets, hand, first)
+    if 2 * num_seen >= targets.sum():
         return first
-    others = [camera_of(view, model, [layout], pose, root) for view in _CANDIDATES]
-    counts = [_shown(markers, wanted, hand, camera) for camera in others]
+    candidates = [camera_of(view, model, [layout], pose, root) for view in _CANDIDATES]
+    counts = [_count_visible(markers, targets, hand, camera) for camera in candidates]
     most = max(counts)
-    return first if 2 * own >= most[0] else others[counts.index(most)]
+    return first if 2 * num_seen >= most[0] else candidates[counts.index(most)]
 
 
-def _shown(markers: Markers, wanted: Array, hand: Mesh, camera: Camera) -> tuple[int, int]:
-    """Return how many of the taxels that are wanted a camera shows, and how many in all."""
+def _count_visible(markers: Markers, targets: Array, hand: Mesh, camera: Camera) -> tuple[int, int]:
+    """Return how many target taxels a camera shows, and how many taxels in all."""
     corners = hand.corners[hand.normals.mean(axis=1) @ camera.toward > 0]
     flat = np.concatenate([camera.project(corners).reshape(-1, 3), camera.project(markers.pos)])[:, :2]
     margin = 1e-3  # [m] so that a single point has a size too
     viewport = viewport_for(camera, np.stack([flat.min(axis=0) - margin, flat.max(axis=0) + margin]), _LOOK, _LOOK)
     fragments = rasterise(viewport.project(corners), _LOOK, _LOOK)
     seen = is_visible(markers, viewport.project(markers.pos), fragments, camera) & (markers.size > 0)
-    return int((seen & wanted).sum()), int(seen.sum())
+    return int((seen & targets).sum()), int(seen.sum())

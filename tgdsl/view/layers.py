@@ -77,7 +77,7 @@ class Layer(ABC):
 
     def __init__(self) -> None:
         self._ends: dict[str, tuple[float, float]] = {}
-        self.members: list[tuple[Any, str, Any]] = []  # what is drawn: viser's handle, its link, its row or rows
+        self.members: list[tuple[Any, str, Any]] = []  # drawn elements: viser's handle, its link, its row or rows
 
     def show(self, links: Collection[str]) -> None:
         """Show these links, and hide the others."""
@@ -226,8 +226,8 @@ class SurfaceLayer(Layer):
             vertices, faces = subdivide_to_size(vertices, faces, float(np.median(sides)), max_iter=20)[:2]
             nearest = KDTree(layout.pos[rows] / sides).query(vertices[faces].mean(axis=1) / sides)[1]
             for cell in np.unique(nearest):
-                own = vertices[faces[nearest == cell]].reshape(-1, 3)
-                places, merged = np.unique(own.round(9), axis=0, return_inverse=True)
+                triangles = vertices[faces[nearest == cell]].reshape(-1, 3)
+                places, merged = np.unique(triangles.round(9), axis=0, return_inverse=True)
                 row = int(rows[cell])
                 name = f"/body{owner}/{output.name}/{link.name}/{row}"
                 handle = scene.add_mesh_simple(name, places, merged.reshape(-1, 3), color=LIVE_REST, flat_shading=True)
@@ -240,7 +240,7 @@ class SurfaceLayer(Layer):
         return Shown(value[self._chosen], self._unit, self._quantity, norm, WARMTH)
 
     def paint(self, colour: UInt8[Array, "row 3"]) -> None:
-        colours = [tuple(own) for own in colour.tolist()]
+        colours = [tuple(rgb) for rgb in colour.tolist()]
         for handle, _, row in self.members:
             handle.color = colours[row]
 

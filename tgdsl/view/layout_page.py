@@ -36,7 +36,7 @@ class LayoutPage:
         draft: The layout.
         out: The file that the button writes.
         is_forced: Whether that may replace a file that the page did not write.
-        port: Port; where it is taken, the next free one.
+        port: Port; if it is in use, the next free one.
 
     Attributes:
         written: Lines that sum up the last file that was written; empty before the first.
@@ -72,7 +72,7 @@ class LayoutPage:
             time.sleep(FRAME)
 
     def react(self) -> None:
-        """Do what was clicked and set since the last call."""
+        """Apply the clicks and settings since the last call."""
         while not self._clicks.empty():
             self._clicks.get()()
         if (self.chosen.value, self.resolution.value) != self._shown:
@@ -108,9 +108,9 @@ class LayoutPage:
 
     def _links(self) -> list[LinkProposal]:
         """Return the chosen links; a group without links chooses none."""
-        proposal, chosen = self.draft.proposal, self.chosen.value
-        names = {f"({group})": members for group, members in proposal.members.items()}.get(chosen, (chosen,))
-        return [link for link in proposal.links if chosen == EVERY or link.name in names]
+        proposal, choice = self.draft.proposal, self.chosen.value
+        names = {f"({group})": members for group, members in proposal.members.items()}.get(choice, (choice,))
+        return [link for link in proposal.links if choice == EVERY or link.name in names]
 
     def _offer(self) -> None:
         """Offer controls for the chosen links, set to the values of the first one."""
@@ -156,12 +156,12 @@ class LayoutPage:
 
     def _try(self, change: Callable[[], None]) -> bool:
         """Change the draft and draw it; where that fails, show the error, restore the draft and return False."""
-        before = self.draft.proposal
+        previous = self.draft.proposal
         try:
             change()
             self._sample()
         except TgdslError as error:
-            self.draft.proposal = before
+            self.draft.proposal = previous
             self.problem.content = f"```\n{error}\n```"
             return False
         self.problem.content = ""
@@ -217,9 +217,9 @@ class LayoutPage:
         self.chosen.value = EVERY if self.chosen.value == name else name
 
     def _draw(self) -> None:
-        """Draw the taxels that have changed, with those of the chosen links in another colour, and count them."""
-        chosen, resolution, links = self._links(), self.resolution.value, self.draft.proposal.links
-        names = {link.name for link in chosen} if self.chosen.value != EVERY else set()
+        """Draw changed taxels, with the chosen links in another colour, and count them."""
+        selected, resolution, links = self._links(), self.resolution.value, self.draft.proposal.links
+        names = {link.name for link in selected} if self.chosen.value != EVERY else set()
         with self.server.atomic():
             for name, (key, samples) in self._sampled.items():
                 state = key, name in names
@@ -232,6 +232,6 @@ class LayoutPage:
                     handle.on_click(lambda _, name=name: self._clicks.put(lambda: self._choose(name)))
                     self._discs[name] = state, handle
                 self._frames[name].show_axes = names == {name}
-            total, part = (sum(link.counts[resolution] for link in some) for some in (links, chosen))
-            area = 1e4 * sum(link.area for link in chosen)
+            total, part = (sum(link.counts[resolution] for link in some) for some in (links, selected))
+            area = 1e4 * sum(link.area for link in selected)
             self.status.content = f"{total} taxels at {resolution}, {part} of them on the chosen {area:.3g} cm²"

@@ -58,7 +58,7 @@ class LiveScene:
     def move(self, poses: Poses, env: int) -> None:
         """Put the bodies where they are; redraw objects that have another shape in this environment."""
         for frame, pos, quat in zip(self.frames.values(), *poses, strict=True):
-            frame.position, frame.wxyz = pos, quat  # viser sends what has changed
+            frame.position, frame.wxyz = pos, quat  # viser sends changes only
         model = self._stage.env_model(env)
         if model is not self._stage.model and (shapes := shapes_of(model)) != self._shapes:
             self._shapes = shapes
@@ -68,7 +68,7 @@ class LiveScene:
                 self._add_body(model, body)
 
     def show_readings(self, names: Iterable[str]) -> None:
-        """Draw these readings in place of the ones before; the first is the chosen one."""
+        """Replace the drawn readings; the first is the chosen one."""
         for layer in self.layers:
             layer.remove()
         self.layers = [
@@ -77,15 +77,15 @@ class LiveScene:
         ]
 
     def show(self, *, robot: bool, objects: bool, taxels: bool, plain: bool, links: set[str]) -> None:
-        """Switch parts on and off; `plain`: the robot in grey in place of its own colours."""
+        """Switch parts on and off; `plain` draws the robot in grey."""
         surfaces = [layer for layer in self.layers if isinstance(layer, SurfaceLayer)]
         covered = frozenset[int]().union(*(layer.bodies for layer in surfaces)) if taxels else frozenset()
         for body, meshes in self._meshes.items():
             is_shown = (robot if body in self.robot else objects) and body not in covered
-            for mesh, own in meshes:
+            for mesh, colour in meshes:
                 mesh.visible = is_shown
                 if body in self.robot:
-                    mesh.color = self._plain(body) if plain or own is None else own
+                    mesh.color = self._plain(body) if plain or colour is None else colour
         for layer in self.layers:
             layer.show(links if taxels else ())
 
@@ -120,7 +120,7 @@ class LiveScene:
             self._forces.visible = True
 
     def name_row(self, rows: Rows, row: int | None, poses: Poses, text: str = "") -> None:
-        """Write text beside a row; None: beside nothing."""
+        """Write text next to a row; None: hide the text."""
         self._name.visible = row is not None
         if row is not None:
             pos, quat = (part[rows.body[row]] for part in poses)
@@ -158,10 +158,10 @@ def add_body(
     """
     meshes = []
     for i, (corners, normals, rgba) in enumerate(body_surfaces(model, body, links)):
-        own = None if rgba is None else tuple(round(255 * part) for part in rgba[:3])
-        style = {"color": colour if is_plain or own is None else own, "opacity": rgba[3] if rgba and rgba[3] < 1 else None}
+        rgb = None if rgba is None else tuple(round(255 * part) for part in rgba[:3])
+        style = {"color": colour if is_plain or rgb is None else rgb, "opacity": rgba[3] if rgba and rgba[3] < 1 else None}
         mesh = scene.add_mesh_simple(f"/body{body}/mesh{i}", *_joined(corners, normals), **style)
-        meshes.append((mesh, own))
+        meshes.append((mesh, rgb))
     return meshes
 
 

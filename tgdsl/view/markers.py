@@ -50,33 +50,33 @@ class Markers(Taxels):
     """The rows of one reading in one environment: taxels, or bodies, and what they read."""
 
     value: Float[Array, " taxel"]  # magnitude of the reading, in `unit`; 0 where it does not exceed `threshold`
-    quantity: str  # what is read, such as `|force|`
+    quantity: str  # name of the quantity, such as `|force|`
     unit: str  # with the prefix that suits the values; empty for plain numbers
     vector: Float[Array, "taxel 3"] | None = None  # the reading itself in the world, in SI units, if it is a vector
     scale: float = 1.0  # converts SI units to `unit`
-    would_read: Bool[Array, " taxel"] | None = None  # which of them would read anything without noise; None: those that do
-    threshold: float = 0.0  # see `THRESHOLDS` [SI]; 0: whatever is read counts
+    would_read: Bool[Array, " taxel"] | None = None  # whether each would read anything without noise; None: as `is_read`
+    threshold: float = 0.0  # see `THRESHOLDS` [SI]; 0: any non-zero reading counts
 
     @property
     def is_read(self) -> Bool[Array, " taxel"]:
-        """Which taxels read anything: those that are coloured."""
+        """Which taxels read anything: these are coloured."""
         return self.value > 0
 
     @property
     def is_touched(self) -> Bool[Array, " taxel"]:
-        """Which taxels read anything, noise apart: those that are counted."""
+        """Which taxels read anything apart from noise: these are counted."""
         return self.is_read if self.would_read is None else self.would_read
 
     @property
     def threshold_label(self) -> str:
-        """The threshold with the prefix that suits it, such as `1 mN`; empty where all that is read counts."""
+        """The threshold with a suitable prefix, such as `1 mN`; empty without a threshold."""
         base = self.unit if self.scale == 1.0 else self.unit[1:]
         factor, prefix = next(((f, p) for f, p in _PREFIXES if f * self.threshold >= 0.1), _PREFIXES[0])
         return f"{factor * self.threshold:g} {prefix}{base}" if self.threshold else ""
 
     @property
     def colour_label(self) -> str:
-        """Label of the colours: quantity, unit, and what is grey."""
+        """Label of the colours: quantity, unit, and the values drawn in grey."""
         unit = f" [{self.unit}]" if self.unit else ""
         return f"{self.quantity}{unit}   (grey: {f'up to {self.threshold_label}' if self.threshold else 'zero'})"
 
@@ -139,7 +139,7 @@ def rows_of(touch: TactileModule, output: Output) -> tuple[list[str], Taxels]:
         return list(table["body"]), taxels
     member = [table["body"] == name for name in output.bodies]
     parts = (taxels.pos, taxels.normal, 3 * taxels.size)
-    return list(output.bodies), Taxels(*(np.array([part[own].mean(axis=0) for own in member]) for part in parts))
+    return list(output.bodies), Taxels(*(np.array([part[mask].mean(axis=0) for mask in member]) for part in parts))
 
 
 def read_now(values: Tensor, env: int) -> Float[Array, "row channel"]:

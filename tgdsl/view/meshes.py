@@ -64,7 +64,7 @@ class Surface(NamedTuple):
 def body_surfaces(model: mujoco.MjModel, body: int, links: Iterable[Link] = ()) -> list[Surface]:
     """Return the triangles of a body by colour: of its geoms that collide, or else of all; no planes.
 
-    If one of `links` has its taxels on a geom or mesh that does not collide, those that do not collide are shown instead.
+    If one of `links` has its taxels on a geom or mesh that does not collide, the non-colliding geoms are shown instead.
     """
     by_colour: dict[tuple[float, float, float, float] | None, list[tuple[Array, Array]]] = {}
     for geom in _shown_geoms(model, body, links):
@@ -81,9 +81,9 @@ def body_surfaces(model: mujoco.MjModel, body: int, links: Iterable[Link] = ()) 
 
 def geom_colour(model: mujoco.MjModel, geom: int) -> tuple[float, float, float, float] | None:
     """Return a geom's colour, or else its material's times the mean of the material's texture; None if it has neither."""
-    own, material = model.geom_rgba[geom], int(model.geom_matid[geom])
-    if not np.allclose(own, _NO_COLOUR) or material < 0:
-        return None if np.allclose(own, _NO_COLOUR) else tuple(own.tolist())
+    geom_rgba, material = model.geom_rgba[geom], int(model.geom_matid[geom])
+    if not np.allclose(geom_rgba, _NO_COLOUR) or material < 0:
+        return None if np.allclose(geom_rgba, _NO_COLOUR) else tuple(geom_rgba.tolist())
     rgba = model.mat_rgba[material].astype(np.float64)
     texture = int(model.mat_texid[material, int(mujoco.mjtTextureRole.mjTEXROLE_RGB)])
     if texture >= 0:
@@ -98,9 +98,9 @@ def _shown_geoms(model: mujoco.MjModel, body: int, links: Iterable[Link]) -> lis
     names = {link.name for link in links}
     geoms = [i for i in range(model.ngeom) if model.geom_bodyid[i] == body and not is_absent(model, i)]
     colliding = [i for i in geoms if model.geom_contype[i] or model.geom_conaffinity[i]]
-    others = [i for i in geoms if i not in colliding]
-    is_on_others = any(names & _names(model, i) for i in others) and not any(names & _names(model, i) for i in colliding)
-    return (others if is_on_others else colliding) or geoms
+    passive = [i for i in geoms if i not in colliding]
+    is_on_passive = any(names & _names(model, i) for i in passive) and not any(names & _names(model, i) for i in colliding)
+    return (passive if is_on_passive else colliding) or geoms
 
 
 def _names(model: mujoco.MjModel, geom: int) -> set[str]:

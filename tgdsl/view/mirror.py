@@ -1,4 +1,4 @@
-"""A page in a process of its own, for a loop that must not wait for it.
+"""A page in a separate process, for a loop that must not wait for it.
 
     page = tgdsl.show(touch, sim)
     for control in controls:
@@ -57,7 +57,7 @@ class Frame(NamedTuple):
     readings: Mapping[str, Array]  # by name, without `env`
     notes: Mapping[str, float | str]
     state: Mapping[str, Array] | None  # see `Stage.state`
-    model: mujoco.MjModel | None  # of this environment, if its shapes are others than those of the frame before
+    model: mujoco.MjModel | None  # of this environment, if its shapes differ from the previous frame's
 
 
 class _Opening(NamedTuple):
@@ -73,7 +73,7 @@ class _Opening(NamedTuple):
 
 
 class LoopPage:
-    """The page of a loop of one's own. Its process ends with `close`, or with the loop's process."""
+    """The page of a user's loop. Its process ends with `close`, or with the loop's process."""
 
     def __init__(self, stage: Stage, host: str = LOCAL, port: int = PORT, priority: int = PRIORITY):
         """Open the page of a stage that the loop advances; see `Page` for host and port.

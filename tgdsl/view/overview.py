@@ -52,11 +52,11 @@ def drawing(
 ) -> Figure:
     """Draw every reading of taxels, bodies or boxes of one environment, a panel for each, whose axes are the figure's.
 
-    Each panel has a scale of its own. An arrow is a vector as it is, in the plane of the picture; the longest is as long in
-    every panel. Readings of bodies have one large marker per body; those of boxes, such as temperatures of cells, colour these.
+    Each panel has a separate scale. An arrow is a vector's projection on the picture; the longest has the same length in every
+    panel. Readings of bodies have one large marker per body; readings of boxes, such as temperatures of cells, colour them.
 
-    `view` is as in `picture.drawing`; `temperatures` are the lowest and highest of the colours of temperatures [°C], by default
-    those that are read, in each panel.
+    `view` is as in `picture.drawing`; `temperatures` are the lowest and highest temperature of the colours [°C]; default: of
+    the readings in each panel.
 
     Raises:
         ViewError: If there is nothing to draw, or no such environment or view.
@@ -77,7 +77,7 @@ def drawing(
     panel = [(ALONE if len(outputs) == 1 else 1.0) * side for side in PANEL]
     width, height = (SUPERSAMPLING * round(0.94 * size * DPI) for size in (panel[0], 0.82 * panel[1]))
     lead = _lead(touch, sim, readings, panels, env)
-    layouts = [own.layout for own in panels.values() if isinstance(own, Boxes)]
+    layouts = [reading.layout for reading in panels.values() if isinstance(reading, Boxes)]
     in_view = seen(touch, sim, lead, env, width, height, view, layouts)
     scene = rendered(in_view) if len(layouts) < len(panels) else None
     figure = new_figure(columns * panel[0], rows * panel[1] + 0.5)
@@ -85,17 +85,17 @@ def drawing(
     grid = figure.add_gridspec(rows, columns, left=0.01, right=0.99, bottom=bottom, top=top, wspace=0.06, hspace=0.3)
     for i, output in enumerate(outputs):
         axes = figure.add_subplot(grid[i])
-        own = panels[output.name]
-        if isinstance(own, Boxes):
-            draw_boxes(axes, sim, in_view, own, env)
+        reading = panels[output.name]
+        if isinstance(reading, Boxes):
+            draw_boxes(axes, sim, in_view, reading, env)
         elif scene is not None:
-            norm = Normalize(0.0, float(own.value.max()) or 1.0)
-            draw_markers(axes, scene, own, norm)
-            _draw_arrows(axes, scene, own)
-            if own.is_read.any():
-                draw_colour_bar(axes.inset_axes((0.46, -0.06, 0.5, 0.022)), norm, HEAT, own.colour_label)
+            norm = Normalize(0.0, float(reading.value.max()) or 1.0)
+            draw_markers(axes, scene, reading, norm)
+            _draw_arrows(axes, scene, reading)
+            if reading.is_read.any():
+                draw_colour_bar(axes.inset_axes((0.46, -0.06, 0.5, 0.022)), norm, HEAT, reading.colour_label)
         axes.set_title(f"{output.name}  ·  {output.kind}", fontsize=11, color=INK, loc="left", pad=18, weight="bold")
-        axes.text(0, 1.02, own.headline, transform=axes.transAxes, fontsize=9.5, color=FAINT)
+        axes.text(0, 1.02, reading.headline, transform=axes.transAxes, fontsize=9.5, color=FAINT)
     figure.text(0.012, 1 - 0.26 / figure.get_figheight(), title, size=15, weight="bold", color=INK, va="center")
     return figure
 

@@ -56,7 +56,7 @@ class Page:
     Args:
         stage: The scene; see `show` for another.
         host: Address to serve at; any but the local one lets others in the network see and control the scene.
-        port: Port; where it is taken, the next free one.
+        port: Port; if it is in use, the next free one.
     """
 
     def __init__(self, stage: Stage, host: str = LOCAL, port: int = PORT):
@@ -71,14 +71,14 @@ class Page:
         return url_of(self.server)
 
     def show(self, stage: Stage) -> None:
-        """Show a stage in place of the one before; the camera stays.
+        """Replace the shown stage; the camera stays.
 
         Raises:
-            TgdslError: If the stage has nothing to draw; the one before stays.
+            TgdslError: If the stage has nothing to draw; the previous one stays.
         """
         outputs = drawn(stage)
         is_first = not hasattr(self, "stage")
-        chosen = None if is_first else self.panel.reading.value
+        reading = None if is_first else self.panel.reading.value
         self.stage, self._outputs = stage, outputs
         self._picked: int | None = None
         self._seen: dict[str, Any] = {"env": 0, "instant": 0, "group": EVERY, "plotted": EVERY, "keyframe": ""}
@@ -87,14 +87,14 @@ class Page:
         self._images_due = 0.0  # when heat maps, spectrogram and observations are drawn again
         self._maps: dict[str, HeatMaps] = {}
         heard = sounding(stage.touch.plan) if stage.is_gapless else ()
-        self._sounds = {own.name: RollingSound(own.name, own.readings[0].units[0], SOUND_SECONDS) for own in heard}
+        self._sounds = {sensor.name: RollingSound(sensor.name, sensor.readings[0].units[0], SOUND_SECONDS) for sensor in heard}
         self._clicks: SimpleQueue[Callable[[], None]] = SimpleQueue()
         later = self._clicks.put
         with self.server.atomic():
             self.server.scene.reset()
             self.server.gui.reset()
             self.scene = LiveScene(self.server, stage, outputs, lambda row: later(lambda: self._pick(row)))
-            self.panel = panel = Panel(self.server.gui, stage, outputs, list(self._sounds), chosen)
+            self.panel = panel = Panel(self.server.gui, stage, outputs, list(self._sounds), reading)
             acts = {"step once": self._step_once, "restart": self._restart}
             panel.time.on_click(lambda event: later(acts[event.target.value]))
             panel.screenshot.on_click(lambda event: send_picture(event.client))
@@ -109,9 +109,9 @@ class Page:
     def run(self, watch: Callable[[], Stage | str | None] = lambda: None, seconds: float = math.inf) -> None:
         """Step the stage in real time and draw it, for some seconds or until interrupted.
 
-        `watch` is asked before each frame for another stage to show, or for text of what is wrong with it; None: nothing new.
+        `watch` is called before each frame and returns another stage to show, an error message about it, or None for no change.
         """
-        begin = before = time.monotonic()
+        begin = last_frame = time.monotonic()
         due = 0.0
         while time.monotonic() - begin < seconds:
             start = time.monotonic()
@@ -127,8 +127,8 @@ class Page:
             if isinstance(change, str):
                 self.panel.problem.content = f"```\n{change}\n```"
             self._react()
-            due = 0.0 if self.panel.paused.value else due + self.panel.speed.value * (start - before)
-            before = start
+            due = 0.0 if self.panel.paused.value else due + self.panel.speed.value * (start - last_frame)
+            last_frame = start
             steps = min(MAX_STEPS, int(due / self.stage.control_step))
             due = min(due - steps * self.stage.control_step, self.stage.control_step)
             for _ in range(steps):
@@ -166,7 +166,7 @@ class Page:
         return file.getvalue()
 
     def _record(self, env: int, pos: Float[Array, "body 3"], quat: Float[Array, "body 4"]) -> None:
-        """Keep a frame for `saved_frames`; an instant of one environment is kept once."""
+        """Store a frame for `saved_frames`, each instant of one environment once."""
         last = self._frames_seen[-1] if self._frames_seen else None
         if not self.stage.readings or (last is not None and (last["time"], last["env"]) == (self.stage.time, env)):
             return
@@ -182,23 +182,23 @@ class Page:
         for layer in self.scene.layers[1:]:
             layer.paint(layer.read(self.stage.readings[layer.output.name], env, layer.channels[0]).colour)
         layer = self.scene.layers[0]
-        rows, shown = layer.rows, layer.read(self.stage.readings[layer.output.name], env, panel.channel.value)
-        layer.paint(shown.colour)
+        rows, current = layer.rows, layer.read(self.stage.readings[layer.output.name], env, panel.channel.value)
+        layer.paint(current.colour)
         is_shown = np.isin(rows.link, list(links))
-        self.scene.draw_arrows(rows, shown, poses, is_shown & panel.parts["arrows"].value)
-        panel.legend.content = legend(shown)
+        self.scene.draw_arrows(rows, current, poses, is_shown & panel.parts["arrows"].value)
+        panel.legend.content = legend(current)
         if with_images:
-            self._draw_images(layer, shown)
+            self._draw_images(layer, current)
         if self._picked is not None:
-            value, name = float(shown.value[self._picked]), f"**{rows.label[self._picked]}**"
-            self.scene.name_row(rows, self._picked, poses, f"{rows.label[self._picked]}: {value:.4g} {shown.unit}")
+            value, name = float(current.value[self._picked]), f"**{rows.label[self._picked]}**"
+            self.scene.name_row(rows, self._picked, poses, f"{rows.label[self._picked]}: {value:.4g} {current.unit}")
             name += f" at ({', '.join(f'{1e3 * part:.1f}' for part in rows.pos[self._picked])}) mm"
         else:
             is_meant = is_shown if panel.plotted.value == EVERY else rows.link == panel.plotted.value
-            value = float(getattr(np, layer.total)(shown.value[is_meant])) if is_meant.any() else 0.0
+            value = float(getattr(np, layer.total)(current.value[is_meant])) if is_meant.any() else 0.0
             name = f"**{layer.total}**" if panel.plotted.value == EVERY else f"**{layer.total} of {panel.plotted.value}**"
             self.scene.name_row(rows, None, poses)
-        panel.value.content = f"{name}: {shown.quantity} {value:.4g} {shown.unit}"
+        panel.value.content = f"{name}: {current.quantity} {value:.4g} {current.unit}"
         self._history.append((self.stage.time, value))
         while not 0 <= self.stage.time - self._history[0][0] <= PLOT_SECONDS:
             self._history.popleft()
@@ -259,7 +259,7 @@ class Page:
     # Controls --------------------------------------------------------------------------------------------------------------
 
     def _react(self) -> None:
-        """Do what was clicked and set since the last frame."""
+        """Apply the clicks and settings since the last frame."""
         while not self._clicks.empty():
             self._clicks.get()()
         panel = self.panel
@@ -299,10 +299,10 @@ class Page:
 
     def _show_readings(self) -> None:
         """Draw the readings that are chosen."""
-        before = self.scene.layers[0].output.name if self.scene.layers else None
+        previous = self.scene.layers[0].output.name if self.scene.layers else None
         self.scene.show_readings(self.panel.readings)
         layer = self.scene.layers[0]
-        if layer.output.name != before:
+        if layer.output.name != previous:
             self._picked = None
             self._history.clear()
             self.panel.channel.options = layer.channels

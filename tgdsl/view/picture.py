@@ -1,4 +1,4 @@
-"""Pictures of touch: the robot with its taxels coloured by reading, beside one heat map per link. No display is needed.
+"""Pictures of touch: the robot with its taxels coloured by reading, and one heat map per link. No display is needed.
 
 Shapes: `taxel` taxels of one sensor, `h` and `w` rows and columns of cells or pixels.
 """
@@ -82,7 +82,7 @@ def drawing(
     maps = {link: np.flatnonzero(table["link"] == link) for link in links[:MAX_MAPS]}
     axes, scene = figure.add_axes(VIEW), rendered(seen(touch, sim, markers, env, width, height, view))
     draw_markers(axes, scene, markers, norm)
-    _draw_names(axes, scene.viewport, {names[link]: markers.pos[chosen].mean(axis=0) for link, chosen in maps.items()})
+    _draw_names(axes, scene.viewport, {names[link]: markers.pos[ids].mean(axis=0) for link, ids in maps.items()})
     _draw_maps(figure, sim.model, markers, table, maps, names, norm)
     resolution = touch.plan.origin.resolution
     figure.text(0.016, 0.955, title or output.name, size=19, weight="bold", color=INK, va="center")
@@ -97,14 +97,14 @@ def drawing(
 
 def chosen_output(touch: TactileModule, readings: Mapping[str, Tensor], name: str | None = None) -> Output:
     """Return the reading of taxels that a picture is of: the one named, or a kinematic taxel's, or else the first."""
-    known = {output.name: output for output in touch.outputs if output.name in readings and output.rows == "taxel"}
-    if not known:
+    outputs = {output.name: output for output in touch.outputs if output.name in readings and output.rows == "taxel"}
+    if not outputs:
         raise ViewError("there is nothing to draw: the readings given hold none of this module's taxels")
     if name is None:
-        return next((output for output in known.values() if output.kind == "kinematic_taxel"), next(iter(known.values())))
-    if name not in known:
-        raise ViewError(f'there is no reading "{name}"; {did_you_mean(name, known, "readings")}')
-    return known[name]
+        return next((output for output in outputs.values() if output.kind == "kinematic_taxel"), next(iter(outputs.values())))
+    if name not in outputs:
+        raise ViewError(f'there is no reading "{name}"; {did_you_mean(name, outputs, "readings")}')
+    return outputs[name]
 
 
 def _draw_names(axes: Axes, viewport: Viewport, places: Mapping[str, Float[Array, " 3"]]) -> None:
@@ -143,12 +143,12 @@ def _draw_maps(
     rows = -(-len(maps) // columns)
     grid = figure.add_gridspec(rows, columns, left=0.60, right=0.985, bottom=0.15, top=0.82, hspace=0.44, wspace=0.16)
     size = _TITLE[min(columns, 4)]
-    for i, (link, chosen) in enumerate(maps.items()):
+    for i, (link, taxel_ids) in enumerate(maps.items()):
         axes = figure.add_subplot(grid[i], anchor="N", label=link)
-        along, is_tip = distal(model, str(table["body"][chosen[0]]), table["pos"][chosen])
-        _draw_map(axes, markers.value[chosen], table[chosen], along, norm)
+        along, is_tip = distal(model, str(table["body"][taxel_ids[0]]), table["pos"][taxel_ids])
+        _draw_map(axes, markers.value[taxel_ids], table[taxel_ids], along, norm)
         mark = "▲ tip" if is_tip else "▲ distal"
-        axes.set_title(f"{names[link]}\n{markers.summary(chosen)}", fontsize=size, color=INK, linespacing=1.35, pad=17)
+        axes.set_title(f"{names[link]}\n{markers.summary(taxel_ids)}", fontsize=size, color=INK, linespacing=1.35, pad=17)
         axes.annotate(mark, (0.5, 1.0), (0, 3), "axes fraction", "offset points", fontsize=size - 1, color=FAINT, ha="center")
     if markers.is_read.any():
         draw_colour_bar(figure.add_axes((0.645, 0.06, 0.295, 0.016)), norm, HEAT, markers.colour_label, 10.0)
@@ -162,16 +162,16 @@ def distal(model: mujoco.MjModel, body: str, pos: Float[Array, "taxel 3"]) -> tu
     It leads to the bodies that move against this one, or else to its taxels, at `pos` in its frame [m]. It begins at the
     joint's anchor, or at the parent's origin where the joint slides, as a slide has no anchor.
     """
-    own = model.body(body).id
+    body_id = model.body(body).id
     state = mujoco.MjData(model)
     mujoco.mj_kinematics(model, state)
-    base = own
+    base = body_id
     while model.body_parentid[base] and not model.body_jntnum[base]:
         base = model.body_parentid[base]
-    rigid = [i for i in range(model.nbody) if model.body_weldid[i] == model.body_weldid[own]]
+    rigid = [i for i in range(model.nbody) if model.body_weldid[i] == model.body_weldid[body_id]]
     ends = [i for i in range(model.nbody) if model.body_parentid[i] in rigid and model.body_jntnum[i] and i != base]
-    rotation = state.xmat[own].reshape(3, 3)
-    end = state.xpos[ends].mean(axis=0) if ends else state.xpos[own] + rotation @ pos.mean(axis=0)
+    rotation = state.xmat[body_id].reshape(3, 3)
+    end = state.xpos[ends].mean(axis=0) if ends else state.xpos[body_id] + rotation @ pos.mean(axis=0)
     joint, start = int(model.body_jntadr[base]), state.xpos[base]
     if joint >= 0:
         slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
@@ -215,7 +215,7 @@ def flat_map(table: Array, along: Float[Array, " 3"]) -> FlatMap:
 
 def _draw_map(axes: Axes, value: Array, table: Array, along: Float[Array, " 3"], norm: Normalize) -> None:
     """Draw one link with its distal end up: a grid as cells, scattered taxels as dots."""
-    shown = np.where(value > 0, value, -1.0)
+    heat = np.where(value > 0, value, -1.0)
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
     places, cells, size = flat_map(table, along)
@@ -223,14 +223,14 @@ def _draw_map(axes: Axes, value: Array, table: Array, along: Float[Array, " 3"],
     if cells is not None:
         axes.patch.set(hatch="////", edgecolor="#d9dce0", linewidth=0)
         edge = 9.0 / max(9, *cells.shape)
-        image = np.ma.masked_array(shown[cells], cells < 0)
+        image = np.ma.masked_array(heat[cells], cells < 0)
         axes.pcolormesh(image, cmap=HEAT, norm=norm, edgecolors="white", linewidth=edge)
         high, wide = size / cells.shape
         axes.set(aspect=np.clip(high / wide, 0.4, 2.5), ylim=(len(cells), 0))
         return
     x, y = 1e3 * places[table["radius"] > 0].T
     width = 0.03 * axes.get_window_extent().height * 72 / DPI
-    axes.scatter(x, y, c=shown[table["radius"] > 0], cmap=HEAT, norm=norm, s=width**2, linewidths=0)
+    axes.scatter(x, y, c=heat[table["radius"] > 0], cmap=HEAT, norm=norm, s=width**2, linewidths=0)
     axes.margins(0.12)
     axes.set_aspect("equal", "datalim")
 
@@ -239,9 +239,9 @@ def short_names(links: list[str]) -> dict[str, str]:
     """Return the names without the leading words that all share, but with at least two words each."""
     words = {link: link.split("_") for link in links}
     shared = 0
-    while len(links) > 1 and len({tuple(own[: shared + 1]) for own in words.values()}) == 1:
+    while len(links) > 1 and len({tuple(parts[: shared + 1]) for parts in words.values()}) == 1:
         shared += 1
-    return {link: "_".join(own[max(min(shared, len(own) - 2), 0) :]) for link, own in words.items()}
+    return {link: "_".join(parts[max(min(shared, len(parts) - 2), 0) :]) for link, parts in words.items()}
 
 
 class HeatMaps:
@@ -258,12 +258,12 @@ class HeatMaps:
         for i, (link, name) in enumerate(short_names(links).items()):
             row, column = divmod(i, columns)
             top, left = row * (side + _HEAD), column * side
-            chosen = np.flatnonzero(table["link"] == link)
-            along, _ = distal(model, str(table["body"][chosen[0]]), table["pos"][chosen])
-            map_ = _map_of(table[chosen], along, room)
+            taxel_ids = np.flatnonzero(table["link"] == link)
+            along, _ = distal(model, str(table["body"][taxel_ids[0]]), table["pos"][taxel_ids])
+            map_ = _map_of(table[taxel_ids], along, room)
             first = top + _HEAD + _MARGIN + (room - len(map_)) // 2, left + _MARGIN + (room - map_.shape[1]) // 2
             pixels = self._taxel[first[0] : first[0] + len(map_), first[1] : first[1] + map_.shape[1]]
-            pixels[:] = np.where(map_ >= 0, chosen[map_], -1)
+            pixels[:] = np.where(map_ >= 0, taxel_ids[map_], -1)
             height, width = self._taxel.shape
             x, y = (left + side / 2) / width, 1 - (top + _HEAD / 2) / height
             figure.text(x, y, shortened(name, side // 6), size=6.5, color=INK, ha="center", va="center")

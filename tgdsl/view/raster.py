@@ -78,7 +78,7 @@ def rasterise(corners: Float[Array, "face 3 3"], width: int, height: int) -> Fra
 
 
 def _draw(fragments: Fragments, corners: Array, face: Array, row: Array, column: Array, width: int) -> None:
-    """Draw triangles at some pixels where they are nearer than what is there."""
+    """Draw triangles at some pixels where they are nearer than the present fragments."""
     is_next = np.diff(face, prepend=face[:1]) > 0  # faces ascend
     drawn, index = np.concatenate([face[:1], face[is_next]]), np.cumsum(is_next)
     start = corners[drawn, 0, :2]
@@ -139,7 +139,7 @@ def light_direction(camera: Camera) -> Float[Array, " 3"]:
 
 
 def downsample(image: Float[Array, "h w 3"], factor: int) -> Array:
-    """Return an image with `factor` times fewer rows and columns, each pixel the mean of those that it replaces."""
+    """Return an image with `factor` times fewer rows and columns; each pixel is the mean of `factor`² pixels."""
     height, width = image.shape[0] // factor, image.shape[1] // factor
     return image.reshape(height, factor, width, factor, 3).mean(axis=(1, 3))
 

@@ -90,8 +90,8 @@ def drawing(
     framed, robot = robot_bodies(model, {model.body(link.body).id for link in links})
     camera = camera_of(view, model, list(layouts.values()), pose, min(framed))
     hand = mesh_of(model, pose, robot, links)
-    shown = [hand.corners[np.isin(hand.body, list(framed))].reshape(-1, 3), *(each.pos for each in taxels)]
-    box = _box(camera.project(np.concatenate(shown))[:, :2])
+    points = [hand.corners[np.isin(hand.body, list(framed))].reshape(-1, 3), *(each.pos for each in taxels)]
+    box = _box(camera.project(np.concatenate(points))[:, :2])
     width, height = size or _natural_size(box, len(layouts))
     rows, columns = round(height * (1 - _HEAD - _FOOT)), int((width - _GAP * height) / len(layouts) - _GAP * height)
     viewport = viewport_for(camera, box, _SUPERSAMPLING * columns, _SUPERSAMPLING * rows)
@@ -122,7 +122,7 @@ def _natural_size(box: Float[Array, "2 2"], panels: int) -> tuple[int, int]:
 
 
 def _image(hand: Mesh, fragments: Fragments, viewport: Viewport) -> Float[Array, "h w 3"]:
-    """Return the hand alone: lit, with hollows darkened by how far they lie behind what is around them."""
+    """Return the hand alone: lit, with hollows darkened by their depth below the surrounding surface."""
     image = np.ones((viewport.height, viewport.width, 3))
     colour = np.broadcast_to(_SURFACE, (len(hand.body), 3))
     image = downsample(shade(image, fragments, hand, colour, viewport), _SUPERSAMPLING)
@@ -138,23 +138,23 @@ def _image(hand: Mesh, fragments: Fragments, viewport: Viewport) -> Float[Array,
 def _draw_taxels(
     axes: Axes, layout: Layout, taxels: Taxels, viewport: Viewport, fragments: Fragments, crossed: Int[Array, " unfelt"]
 ) -> None:
-    """Draw those in view as discs with a tick along the normal, far ones first; those that are hidden as faint rings."""
+    """Draw visible taxels as discs with a tick along the normal, far ones first, and hidden taxels as faint rings."""
     at = viewport.project(taxels.pos)
     seen, active = is_visible(taxels, at, fragments, viewport.camera), taxels.size > 0
     radius = radii(layout, taxels.pos)
     rims = viewport.project(discs(taxels, radius))[..., :2]
     ends = viewport.project(taxels.pos + 2.0 * radius[:, None] * taxels.normal)
-    chosen = group_of(layout)
-    names = list(dict.fromkeys(chosen))
-    colour = np.array([to_rgb(COLOURS[names.index(group) % len(COLOURS)]) for group in chosen])[layout.link_id]
+    groups = group_of(layout)
+    names = list(dict.fromkeys(groups))
+    colour = np.array([to_rgb(COLOURS[names.index(group) % len(COLOURS)]) for group in groups])[layout.link_id]
     lit = np.minimum(colour * (0.72 + 0.33 * np.clip(taxels.normal @ light_direction(viewport.camera), 0, 1))[:, None], 1)
     order = np.argsort(at[:, 2], kind="stable")
-    shown, hidden = (order[(mask & active)[order]] for mask in (seen, ~seen))
+    visible, hidden = (order[(mask & active)[order]] for mask in (seen, ~seen))
     rings = [(*rgb, 0.3) for rgb in colour[hidden]]
     axes.add_collection(PolyCollection(list(rims[hidden]), fc="none", ec=rings, lw=0.5, zorder=3, gid="hidden"))
-    axes.add_collection(PolyCollection(list(rims[shown]), fc=list(lit[shown]), ec="white", lw=0.35, zorder=4, gid="shown"))
-    ticks = list(np.stack([at[shown, :2], ends[shown, :2]], axis=1))
-    axes.add_collection(LineCollection(ticks, colors=list(0.45 * colour[shown]), lw=0.6, zorder=5, gid="normals"))
+    axes.add_collection(PolyCollection(list(rims[visible]), fc=list(lit[visible]), ec="white", lw=0.35, zorder=4, gid="shown"))
+    ticks = list(np.stack([at[visible, :2], ends[visible, :2]], axis=1))
+    axes.add_collection(LineCollection(ticks, colors=list(0.45 * colour[visible]), lw=0.6, zorder=5, gid="normals"))
     if len(crossed):
         ends = rims[np.repeat(crossed, 2)[:, None], np.tile(_DIAGONALS, (len(crossed), 1))]
         colours = [(*to_rgb(_CROSS), 1.0 if is_seen else 0.3) for is_seen in np.repeat(seen[crossed], 2)]
@@ -164,9 +164,9 @@ def _draw_taxels(
 def _draw_captions(axes: Axes, name: str, layout: Layout, num_crossed: int) -> None:
     """Write the panel's name and its number of taxels above it, and the number of each group below."""
     count, fillers = int((layout.radius > 0).sum()), int((layout.radius == 0).sum())
-    told = f"{count} taxels" + (f" and {fillers} inactive" if fillers else "")
+    counts = f"{count} taxels" + (f" and {fillers} inactive" if fillers else "")
     title = TextArea(name, textprops={"size": 12, "weight": "bold", "color": INK})
-    line = HPacker(children=[title, TextArea(told, textprops={"size": 12, "color": FAINT})], pad=0, sep=8, align="baseline")
+    line = HPacker(children=[title, TextArea(counts, textprops={"size": 12, "color": FAINT})], pad=0, sep=8, align="baseline")
     place = {"bbox_to_anchor": (0.5, 1.0), "bbox_transform": axes.transAxes, "borderpad": 0.5, "pad": 0.0}
     axes.add_artist(AnchoredOffsetbox("lower center", child=line, frameon=False, **place))
     handles = [
@@ -184,10 +184,10 @@ def radii(layout: Layout, pos: Float[Array, "taxel 3"]) -> Float[Array, " taxel"
     """Return the radius of each disc [m]: the same on a link, and small enough to leave room between neighbours."""
     radius = np.full(len(pos), DISC_RADIUS[1])
     for link in range(len(layout.links)):
-        own = np.flatnonzero(layout.link_id == link)
-        if len(own) > 1:
-            apart = KDTree(pos[own]).query(pos[own], k=2)[0][:, 1]
-            radius[own] = np.clip(0.44 * np.median(apart), *DISC_RADIUS)
+        members = np.flatnonzero(layout.link_id == link)
+        if len(members) > 1:
+            apart = KDTree(pos[members]).query(pos[members], k=2)[0][:, 1]
+            radius[members] = np.clip(0.44 * np.median(apart), *DISC_RADIUS)
     return radius
 
 
@@ -212,12 +212,12 @@ def legend(layout: Layout) -> dict[str, int]:
 
     A group some of whose links have the colour of a smaller one is called `other`.
     """
-    chosen = group_of(layout)
+    group_names = group_of(layout)
     active = np.bincount(layout.link_id[layout.radius > 0], minlength=len(layout.links))
     counts: dict[str, int] = {}
-    for group in dict.fromkeys(chosen):
-        is_whole = chosen.count(group) == len(layout.groups.get(group, ()))
+    for group in dict.fromkeys(group_names):
+        is_whole = group_names.count(group) == len(layout.groups.get(group, ()))
         nobody = "no group" if layout.groups else "taxels"
         label = nobody if not group else group if is_whole else f"other {group}"
-        counts[label] = int(sum(active[i] for i, own in enumerate(chosen) if own == group))
+        counts[label] = int(sum(active[i] for i, name in enumerate(group_names) if name == group))
     return counts

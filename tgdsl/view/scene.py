@@ -39,7 +39,7 @@ class RenderedScene(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What is in view: the robot, the bodies of it that carry sensors, the felt objects; and the pixels it fills."""
+    """The visible meshes: the robot, its bodies with sensors, the objects of the sensors; and the viewport."""
 
     hand: Mesh
     carriers: frozenset[int]
@@ -80,7 +80,7 @@ def seen(
 
 
 def rendered(seen: Seen, paint: Paint | None = None) -> RenderedScene:
-    """Draw what is in view; objects are fainter over a robot that is painted."""
+    """Draw the visible meshes; objects are fainter over a painted robot."""
     hand, carriers, objects, viewport = seen
     fragments = rasterise(viewport.project(hand.corners), viewport.width, viewport.height)
     colour = np.where(np.isin(hand.body, list(carriers))[:, None], SENSING, OTHER)
@@ -99,25 +99,25 @@ def rendered(seen: Seen, paint: Paint | None = None) -> RenderedScene:
 
 
 def draw_markers(axes: Axes, scene: RenderedScene, markers: Markers, norm: Normalize) -> None:
-    """Draw taxels on their scene; those behind a surface of the robot as rings if they read, else not at all."""
+    """Draw taxels on their scene; behind a surface of the robot, reading ones as rings and the others not at all."""
     viewport = scene.viewport
     draw_image(axes, scene.image, viewport)
     at = viewport.project(markers.pos)
     seen = is_visible(markers, at, scene.fragments, viewport.camera)
     size = np.minimum(markers.size, np.median(markers.size))
     area = (np.clip(0.62 * viewport.scale / SUPERSAMPLING * size, 3.5, 20.0) * 72 / DPI) ** 2
-    shown, hidden, rest = seen & markers.is_read, ~seen & markers.is_read, seen & ~markers.is_read & (markers.size > 0)
+    in_front, hidden, rest = seen & markers.is_read, ~seen & markers.is_read, seen & ~markers.is_read & (markers.size > 0)
     axes.scatter(*at[rest, :2].T, s=0.3 * area[rest], c="#8d949e", linewidths=0, zorder=3)
     ring = HEAT(norm(markers.value[hidden]))
     axes.scatter(*at[hidden, :2].T, s=0.6 * area[hidden], facecolors="none", edgecolors=list(ring), linewidths=1.0, zorder=4)
-    order = np.argsort(markers.value[shown], kind="stable")
-    place, value, size = at[shown, :2][order], markers.value[shown][order], area[shown][order]
+    order = np.argsort(markers.value[in_front], kind="stable")
+    place, value, size = at[in_front, :2][order], markers.value[in_front][order], area[in_front][order]
     axes.scatter(*place.T, s=size, c=value, cmap=HEAT, norm=norm, edgecolors=INK, linewidths=0.5, zorder=5)
     draw_scale_bar(axes, viewport, -44.0)
 
 
 def draw_image(axes: Axes, image: Float[Array, "h w 3"], viewport: Viewport) -> None:
-    """Fill axes with an image, so that their coordinates are those of the viewport [pixel]."""
+    """Fill axes with an image, in the viewport's coordinates [pixel]."""
     extent = (-0.5, viewport.width - 0.5, -0.5, viewport.height - 0.5)
     axes.imshow(image, origin="lower", extent=extent, interpolation="nearest", aspect="auto")
     axes.set_axis_off()
@@ -144,7 +144,7 @@ def draw_colour_bar(axes: Axes, norm: Normalize, colours: Colormap, label: str, 
 
 
 def _bounds(hand: Array, objects: Array) -> Array:
-    """Return the lower and upper corner of what is to be seen: the hand, and objects unless they are far off."""
+    """Return the lower and upper corner of the view: the hand, and objects near it."""
     low, high = hand[..., :2].min(axis=(0, 1)), hand[..., :2].max(axis=(0, 1))
     room = 0.3 * (high - low).max()
     if len(objects):

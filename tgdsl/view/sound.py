@@ -122,7 +122,7 @@ class RollingSound:
 
 
 def draw(sounds: Sequence[Sound], path: Path, title: str = "", marks: Mapping[str, Sequence[float]] | None = None) -> Path:
-    """Draw the spectrograms of some sounds, one above the other; `marks` are frequencies beside each, by its name [Hz]."""
+    """Draw spectrograms of sounds, one above the other; `marks` are frequencies to mark in each, by its name [Hz]."""
     figure = new_figure(8.0, 0.6 + 1.9 * len(sounds), dpi=150, layout="constrained")
     axes = figure.subplots(len(sounds), 1, sharex=True, squeeze=False)[:, 0]
     for axis, sound in zip(axes, sounds, strict=True):

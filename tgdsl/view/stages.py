@@ -73,7 +73,7 @@ class Stage(ABC):
     readings: Mapping[str, Tensor]  # what the taxels read then
     # values that a user may set, one for each of `sliders`; None where something else acts
     control: Float[Array, " actuator"] | None = None
-    by_hand: bool | None = None  # whether `control` acts in place of a policy; None: there is no policy
+    by_hand: bool | None = None  # whether `control` replaces the policy; None: there is no policy
     groups: Sequence[str] = ()  # names of the groups of observations
     is_gapless = True  # whether `advance` makes each control step, so that sounds are joined
     num_steps: int | None = None  # number of instants of a recorded run; None: the scene goes on without end

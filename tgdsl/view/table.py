@@ -14,7 +14,7 @@ from tgdsl.view.markers import THRESHOLDS, read_now
 
 
 def outputs_on_taxels(touch: TactileModule) -> list[Output]:
-    """Return the readings of taxels, and of the bodies that carry them: those that have a place on the robot."""
+    """Return the readings that have a place on the robot: of taxels, and of the bodies that carry them."""
     sensors = {sensor.sensor for sensor in touch.plan.sensors if len(sensor.taxels)}
     return [output for output in touch.outputs if output.rows in ("taxel", "body") and output.sensor in sensors]
 
@@ -23,8 +23,8 @@ def table(touch: TactileModule, readings: Mapping[str, Tensor], env: int = 0) ->
     """Return the readings of one environment, link by link.
 
     Each reading has one column: force as the magnitude of the link's summed force, contact as the number of taxels in contact,
-    any other channel or vector as the largest magnitude. Readings of bodies show the link's body. Readings with rows of their
-    own, such as one per inertial sensor, follow with a line for each row; those of joints and actuators are left out.
+    any other channel or vector as the largest magnitude. Readings of bodies show the link's body. Readings with other rows,
+    such as one per inertial sensor, follow with a line for each row; readings of joints and actuators are left out.
     """
     taxels = touch.taxels
     outputs = outputs_on_taxels(touch)
@@ -33,13 +33,13 @@ def table(touch: TactileModule, readings: Mapping[str, Tensor], env: int = 0) ->
     header = ["link"] + [f"{output.name} [{unit}]" for output, unit in zip(outputs, units, strict=True)]
     rows = [[link] + [_cell(taxels[output.sensor], output, readings, link, env) for output in outputs] for link in links]
     lines = _aligned(header, rows) if outputs else []
-    for output in (own for own in touch.outputs if own not in outputs and own.rows not in ("joint", "actuator")):
-        lines += ([""] if lines else []) + _own_rows(touch.rows[output.name], output, readings, env)
+    for output in (o for o in touch.outputs if o not in outputs and o.rows not in ("joint", "actuator")):
+        lines += ([""] if lines else []) + _other_rows(touch.rows[output.name], output, readings, env)
     return lines
 
 
-def _own_rows(table: TaxelTable, output: Output, readings: Mapping[str, Tensor], env: int) -> list[str]:
-    """Return a reading with rows of its own: by the first column of its table, each channel of the last sample.
+def _other_rows(table: TaxelTable, output: Output, readings: Mapping[str, Tensor], env: int) -> list[str]:
+    """Return a reading with other rows: by the first column of its table, each channel of the last sample.
 
     Rows that share that column, such as the cells of a link, are one line: how many they are, the lowest and the highest.
     """
@@ -48,13 +48,13 @@ def _own_rows(table: TaxelTable, output: Output, readings: Mapping[str, Tensor],
     channels = [f"{name} [{unit}]" for name, unit in zip(output.channels, output.units, strict=True)]
     names = list(dict.fromkeys(table[first].tolist()))
     if len(names) == len(table):
-        rows = [[str(name), *_numbers(own, output.units)] for name, own in zip(names, values, strict=True)]
+        rows = [[str(name), *_numbers(samples, output.units)] for name, samples in zip(names, values, strict=True)]
         return [output.name, *_aligned([output.rows, *channels], rows)]
     rows = []
     for name in names:
-        own = values[table[first] == name]
-        ends = zip(_numbers(own.min(axis=0), output.units), _numbers(own.max(axis=0), output.units), strict=True)
-        rows.append([str(name), str(len(own)), *map(" … ".join, ends)])
+        samples = values[table[first] == name]
+        ends = zip(_numbers(samples.min(axis=0), output.units), _numbers(samples.max(axis=0), output.units), strict=True)
+        rows.append([str(name), str(len(samples)), *map(" … ".join, ends)])
     return [output.name, *_aligned([first, f"{output.rows}s", *channels], rows)]
 
 
@@ -72,11 +72,11 @@ def _aligned(header: list[str], rows: list[list[str]]) -> list[str]:
 
 
 def _cell(taxels: TaxelTable, output: Output, readings: Mapping[str, Tensor], link: str, env: int) -> str:
-    own = taxels["link"] == link
-    if not own.any():
+    is_on_link = taxels["link"] == link
+    if not is_on_link.any():
         return "–"
     values = read_now(readings[output.name], env)
-    values = values[[output.bodies.index(taxels["body"][own][0])]] if output.rows == "body" else values[own]
+    values = values[[output.bodies.index(taxels["body"][is_on_link][0])]] if output.rows == "body" else values[is_on_link]
     if output.channels == ("contact",):
         return f"{int(values.sum())}/{len(values)}"
     if output.channels[:3] == ("force_x", "force_y", "force_z"):

@@ -54,13 +54,13 @@ class TouchTrace:
         links = list(dict.fromkeys(self._table["link"].tolist()))
         reduce = np.sum if self._output.units[0] in ("N", "N·m") else np.max
         each = np.stack([reduce(self.values[:, self._table["link"] == link], axis=1) for link in links], axis=1)
-        shown = np.sort(np.argsort(-each.max(axis=0, initial=0.0), kind="stable")[:MAX_MAPS])
+        link_ids = np.sort(np.argsort(-each.max(axis=0, initial=0.0), kind="stable")[:MAX_MAPS])
         names, unit = short_names(links), self._output.units[0]
         stem = self._output.channels[0].removesuffix("_x")
         full = float(each.max(initial=0.0))
         quantity = f"Σ |{stem}|" if reduce is np.sum else f"largest {stem}"
         title = f"{quantity}, full: {full:.3g} {'' if unit == '1' else unit}; spheres: up to {self.values.max(initial=0.0):.2g}"
-        return LinkBars(tuple(names[links[i]] for i in shown), each[:, shown] / (full or 1.0), title.strip())
+        return LinkBars(tuple(names[links[i]] for i in link_ids), each[:, link_ids] / (full or 1.0), title.strip())
 
 
 class LinkBars:
