@@ -171,11 +171,10 @@ def test_onnx_runtime_computes_what_the_module_computes(name, request, tmp_path)
 @pytest.mark.slow
 @needs_compiler
 @pytest.mark.filterwarnings(ONNX_NOISE)
-def test_a_compiled_package_computes_what_the_module_computes_in_python_and_in_cpp(tmp_path, monkeypatch):
+def test_a_compiled_package_computes_what_the_module_computes_in_python_and_in_cpp(tmp_path):
     """Generating the package takes most of the time, so one serves both; examples/cpp is built here."""
     noise = {"gain": [0.8, 1.2], "read_delay": 0.013, "white_noise": 2e-4}
     touch = tgdsl.compile(document(tmp_path, {"a": {"kind": "contact_depth", "noise": noise, "history": 3}})).seed(11)
-    monkeypatch.setattr(torch._inductor.config.cpp, "simdlen", 1)  # code for vectors takes twice the time to write
     signature = touch.export(tmp_path / "hand.aoti.pt2", dt=0.01)
     assert verify(tmp_path / "hand.aoti.pt2", touch).is_equal
     program = torch._inductor.aoti_load_package(str(tmp_path / "hand.aoti.pt2"))
