@@ -1,1 +1,1 @@
-"""The Plan: everything that is to be computed, as immutable data."""
+"""The Plan: the whole computation as immutable data."""

@@ -62,7 +62,7 @@ class Plan:
     sensors: tuple[PlannedSensor[np.ndarray], ...]  # sensors, in the document's order
     proprioception: tuple[PlannedReading, ...]  # fields of joints and actuators that are readings too
     observations: tuple[PlannedObservation[np.ndarray], ...]  # observation terms, in the document's order
-    dropped: tuple[tuple[str, str], ...]  # what the scene or the document has and the module does not need, and why
+    dropped: tuple[tuple[str, str], ...]  # unused parts of the scene or the document, and why
     unfelt: tuple[Unfelt, ...]  # taxels that cannot reach anything their sensors feel, and why
     scene: SceneFile  # the instrumented scene
 

@@ -29,7 +29,7 @@ class PlannedAxis:
 
 @dataclass(frozen=True)
 class PlannedReading:
-    """One entry of a module's readings: its name, what it has rows of, name and unit of each channel.
+    """One entry of a module's readings: its name, the axis of its rows, name and unit of each channel.
 
     `steps` calls, or samples of a block, are stacked in it, oldest first; 0: it is of one call and has no such dimension.
     """
@@ -94,7 +94,7 @@ class PlannedSensor(Generic[Array]):
     uses: Mapping[str, int]  # index of its use, by quantity
     joined: tuple[str, ...]  # the sensors that are computed as one, in the order of the uses' rows; empty if it is alone
     rows: tuple[int, int]  # its rows among the uses' rows: the first, and one beyond the last
-    state: Mapping[str, PlannedMemory]  # what it carries from one call to the next: the kind's own, `noise/…` and `sample/…`
+    state: Mapping[str, PlannedMemory]  # its state between calls: the kind's, `noise/…` and `sample/…`
     signal: tuple[str, ...]  # channels of the signal that noise and sampling act on
     readings: tuple[PlannedReading, ...]  # its own, measured if it has noise; the clean one, if read too; reports
     axes: tuple[PlannedAxis, ...]  # axis of each reading's rows

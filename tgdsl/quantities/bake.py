@@ -56,7 +56,7 @@ class Baked:
     origin: Float[np.ndarray, " 3"]  # place of node (0, 0, 0) [m]
     cell: float  # spacing of the nodes [m]
     method: str  # name of the function of `tgdsl.geometry.grid` that interpolates: trilinear or tricubic
-    errors: Errors  # what the grid costs in accuracy
+    errors: Errors  # errors of the grid
     flaws: tuple[str, ...]  # what of the surface its user should know: see `Outer`
 
 

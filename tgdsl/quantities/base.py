@@ -192,7 +192,7 @@ class Quantity(ABC):
     is_fused: ClassVar[bool] = False
 
     reads: ClassVar[tuple[str, ...]] = ()  #: fields of `SceneState` that are read, whatever is asked
-    shown: ClassVar[str] = ""  #: what an account of a sensor says of a use
+    shown: ClassVar[str] = ""  #: a use in a sensor's report
 
     def plan(self, planning: Planning, uses: Sequence[Use]) -> Any:
         """Return the part of the Plan for all uses; mistakes go to `planning.report`, and then the part does not matter."""
@@ -227,11 +227,11 @@ class Quantity(ABC):
         raise NotImplementedError
 
     def is_light(self, part: Any) -> bool:
-        """Return whether little is computed per taxel, so that kernels may be tiled over environments and taxels."""
+        """Return whether the work per taxel is small, so kernels may be tiled over environments and taxels."""
         return False
 
     def explain(self, part: Any, use: int, objects: Sequence[PairedObject]) -> list[str]:
-        """Return what an account of a sensor says of a use."""
+        """Return a use's lines in a sensor's report."""
         return [self.shown] if self.shown else []
 
     def account(self, part: Any, objects: Sequence[PairedObject]) -> dict[str, list[str]]:

@@ -43,7 +43,7 @@ from tgdsl.tensors.operations import Operation
 
 # The shapes that the search knows; to it a sphere is a capsule without a length.
 SEARCHED = ("", "plane", "sphere", "capsule", "cylinder", "box")
-EVERYWHERE = 3e38  # bound of a plane [m]: finite, but not its square, so that no place is beyond it, and −∞ added to it is −∞
+EVERYWHERE = 3e38  # bound of a plane [m]: its square is infinite, so no point is beyond it; −∞ added to it is −∞
 MARGIN = 10 * planes.tie()  # a geom is passed over farther than its reach and this [m]: beyond what counts as equal in float32
 
 
@@ -206,7 +206,7 @@ def penetration(
     reach: Float[Tensor, "object *env taxel"],
     wants: Collection[str],
 ) -> Penetration:
-    """Return what the probes feel; the deepest object wins, the first among equals.
+    """Return the probes' penetration; the deepest object wins, the first among equals.
 
     `reach` is the radius of each probe towards each object [m], −∞ where the probe is inactive or the pair cannot meet; `wants`
     names the optional parts of the answer: "normal", "motion", "distance", "frame".
@@ -359,7 +359,7 @@ class DepthUse(Generic[Array]):
     wants: tuple[str, ...]  # further results: "distance", "frame", "motion", "normal"
     radius_noise: str  # the sensor whose noise disturbs the radii, if any
     reach: Array  # how far each probe feels each object [m], (object, taxel); −∞ where it does not
-    search: SearchPart[Array] | None  # what a search by a kernel is given; None where it is of no use
+    search: SearchPart[Array] | None  # inputs of the kernel's search; None where it has no use
 
 
 @dataclass(frozen=True, eq=False)
@@ -568,7 +568,7 @@ def _query(
 def _search(
     planning: Planning, names: Sequence[str], wants: Sequence[str], pair: np.ndarray, tables: Mapping[str, GeomTable]
 ) -> SearchPart[np.ndarray] | None:
-    """Return what a search by a kernel is given; None where it cannot answer."""
+    """Return the inputs of the kernel's search; None where it cannot answer."""
     if any(name not in tables for name in names):
         return None  # which has been reported
     if not is_searchable([shape for name in names for shape in tables[name].shapes], wants):

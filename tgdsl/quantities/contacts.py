@@ -121,7 +121,7 @@ class PairContacts(NamedTuple):
     """The contacts of each body and object, in world axes; planes (env, body, object, slot)."""
 
     pos: Vec  # contact points [m]
-    force: Vec  # force on the body at each [N], what the slots lack of each pair's whole force shared out
+    force: Vec  # force on the body at each [N], with each pair's remaining force shared out
     torque: Vec | None  # torque on the body at each [N·m]; None if it was not asked for
     normal: Vec  # unit normal out of the object; NaN where the state has a force without one
     is_used: Bool[Tensor, "env body object slot"]  # which slots are contacts
@@ -142,7 +142,7 @@ def pair_contacts(state: Mapping[str, Tensor], index: Int[Tensor, "body object"]
 
 
 def _completed(whole: Vec, force: Vec, is_used: Bool[Tensor, "env body object slot"]) -> Vec:
-    """Return the contacts' forces with what they lack of each pair's whole force, (env, body, object) [N], shared out."""
+    """Return the contacts' forces [N], with the rest of each pair's net force (env, body, object) shared out."""
     lacking = planes.vec(total - part.sum(dim=-1) for total, part in zip(whole, force, strict=True))
     size = planes.safe_sqrt(planes.dot(force, force))
     total = size.sum(dim=-1, keepdim=True)
@@ -173,7 +173,7 @@ class ReferenceContacts:
 
 
 def reference_contacts(scene: ReferenceScene, pair: int | np.integer) -> list[list[np.ndarray]]:
-    """Return a pair's contacts (place, force, torque, normal), what they lack of its whole force added by shares of force."""
+    """Return a pair's contacts (position, force, torque, normal); the rest of its net force is shared out by force."""
     if "contact_force" not in scene.fields:
         return []
     whole = scene.fields["contact_netforce"][pair]
@@ -254,7 +254,7 @@ class Loads(Request[PairLoads]):
     slots: int = DEFAULT_PATCH_SLOTS  # contacts per body and object that are read
     # whose loads they are to be summed up for: geoms that two objects share load a link once, but both objects
     of: Literal["link", "object"] = "link"
-    # whether the centre and the mean normal of the contacts are wanted, in the frame of what they are of
+    # whether to return the contacts' centre and mean normal, in the frame of the link or object
     has_center: bool = False
     wants_contacts: ClassVar[bool] = True
 

@@ -99,7 +99,7 @@ def deepest_kernel(
         last = first + tl.load(spheres + 1).to(tl.int32)
         pair, radius, shift, strange = next_pair, next_radius, next_shift, next_strange
         at = pose + pair * pose_pair
-        # The next object is loaded before this one is judged, as it takes long; after the last one it is that one again.
+        # Prefetch the next object to hide the load's latency; the last iteration loads the last object again.
         is_more = k + 1 < num_objects
         own_pair += tl.where(is_more, NUM_TAXELS, 0)
         radii += tl.where(is_more, reach_object, 0)

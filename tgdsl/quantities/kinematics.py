@@ -129,7 +129,7 @@ class JointDrive(NamedTuple):
     """
 
     velocity: Any  # velocity ω [rad/s; slides: m/s]
-    effort: Any  # what the actuators exert τ [N·m; slides: N]
+    effort: Any  # actuator efforts τ [N·m; slides: N]
     place: Any  # where the joint's anchor is in the world [m], in the dtype of the state
 
 

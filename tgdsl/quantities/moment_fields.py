@@ -30,7 +30,7 @@ from tgdsl.surfaces.quadrature import Pieces, Quadrature, extent, outer_surface
 
 FORMAT = b"tgdsl moments 2"
 CHOICE_POINTS, REPORT_POINTS = 1024, 2048
-HEADROOM = 0.95  # the choice holds the tolerance with something to spare, so that as a rule the held-back points hold it too
+HEADROOM = 0.95  # the choice keeps a margin to the tolerance, so the held-out points usually satisfy it too
 FINER = 2.0  # how many times finer than the field's the quadrature is that it is measured against
 GRADIENT_FINENESS = 24  # pieces along a radius where gradients have a tolerance; fewer where it is more than one over this
 BRICK = 6  # nodes along the side of a brick that is computed at once
@@ -63,7 +63,7 @@ class BakedField:
     values: Float[np.ndarray, "x y z channel"]
     origin: Float[np.ndarray, " 3"]  # place of node (0, 0, 0) [m]
     cell: float  # spacing of the nodes [m]
-    errors: FieldErrors  # what the lattice costs in accuracy
+    errors: FieldErrors  # errors of the lattice
 
 
 def spacing_of(geoms: Sequence[SurfaceGeom]) -> float:
@@ -153,7 +153,7 @@ def _bake(geoms: Sequence[SurfaceGeom], radius: float, limits: Limits, with_slop
     # of S0's gradients falls as the cell: about 0.17 h/R.
     cell = radius * float(np.clip(2 * np.sqrt(tolerance / 0.4), 0.05, 0.5))
     cell = cell if gradient_tolerance is None else min(cell, radius * gradient_tolerance / 0.17)
-    # Before anything is summed: what a budget holds also bounds how many pieces there are.
+    # Checked before any sum: the budget also bounds the number of pieces.
     needed = 4 * channels * int(np.prod(_lattice(extent(geoms), radius, cell)[1]))
     if needed > budget:
         raise BakeError(_too_large(radius, limits, needed))
@@ -241,7 +241,7 @@ def moment_sums(
         near = np.array(surface.tree.query_ball_point(middle, reach), dtype=np.int64)
         if not len(near):
             continue
-        # About the middle, so that squares of small distances keep their digits.
+        # Relative to the middle, to keep the digits of small squared distances.
         points, here = torch.from_numpy(surface.pos[near] - middle), torch.from_numpy(block_pos - middle)
         weight = torch.relu(radius - torch.cdist(here, points))
         area = torch.from_numpy(surface.area[near])[:, None]
@@ -337,10 +337,10 @@ class Cloud:
 
 
 def sample_points(geoms: Sequence[SurfaceGeom], count: int) -> tuple[Float[np.ndarray, "n 3"], float]:
-    """Return points drawn alike from all of an object's outer surface [m], always the same ones, and its whole area [m²].
+    """Return seeded points, uniform on an object's outer surface [m], and its area [m²].
 
-    Points that are near each other mostly follow each other, so that those in contact are in few runs. Kept in the user's cache
-    folder; none of the geoms is a plane.
+    Near points are mostly consecutive, so the points in contact form few runs. The result is saved in the user's cache folder.
+    None of the geoms is a plane.
     """
 
     def make() -> tuple[np.ndarray, float]:

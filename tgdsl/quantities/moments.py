@@ -253,17 +253,17 @@ class _Moments(Quantity):
                 size = field.values[0].nbytes * int(field.num[i].prod())
                 which = f"variant {i // num_radii}, " if len(table.area) > 1 else ""
                 nodes = f"{' × '.join(map(str, field.num[i]))} nodes every {1e3 * accuracy['cell']:.3g} mm, {size} bytes"
-                shown = {key: percent(value) for key, value in accuracy.items()}
+                percents = {key: percent(value) for key, value in accuracy.items()}
                 lines += [
                     f"{objects[table.object].name}, {which}radius {1e3 * accuracy['radius']:.3g} mm: {nodes}",
-                    f"  RMS error of S0 {shown['mass_rms']} of full scale (largest {shown['mass_max']}), of S1"
-                    f" {shown['first_rms']} (largest {shown['first_max']})",
+                    f"  RMS error of S0 {percents['mass_rms']} of full scale (largest {percents['mass_max']}), of S1"
+                    f" {percents['first_rms']} (largest {percents['first_max']})",
                 ]
                 if "gradient_p999" in accuracy:
-                    p999, largest = shown["gradient_p999"], f"(largest error {shown['gradient_max']})"
+                    p999, largest = percents["gradient_p999"], f"(largest error {percents['gradient_max']})"
                     lines.append(
                         f"  gradients: 99.9 % of S0's within {p999} of the largest {largest}, of S1's within"
-                        f" {shown['first_gradient_p999']}"
+                        f" {percents['first_gradient_p999']}"
                     )
         return {"fields of moments": lines} if lines else {}
 

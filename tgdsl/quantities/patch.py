@@ -87,7 +87,7 @@ def slots_of(contacts: Contacts, sides: Sides, dtype: torch.dtype) -> list[Slot]
 
 
 def _normal_forces(whole: Vec, touches: list[Touch]) -> list[Tensor]:
-    """Return each contact's normal force with what the pair's forces lack of the whole one [N]."""
+    """Return each contact's normal force, with the pair's remaining force shared out [N]."""
     lacking = whole
     for touch in touches:
         lacking = planes.sub(lacking, touch.force)

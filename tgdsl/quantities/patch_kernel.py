@@ -127,7 +127,7 @@ def _sum(weight, vectors):
 
 @triton.jit
 def _normal_force(push, out, whole, is_used):
-    """Return normal forces, at least 0, with what the forces of a pair lack of its whole one (P, S) [N]."""
+    """Return normal forces, at least 0, with each pair's remaining force shared out (P, S) [N]."""
     x, y, z = (
         whole[0] - tl.sum(push[0], axis=1),
         whole[1] - tl.sum(push[1], axis=1),

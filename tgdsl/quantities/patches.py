@@ -144,7 +144,7 @@ class ContactPatch(NamedTuple):
     objects: HeatOfObjects  # materials of the objects
     topology: Topology  # which patch joins what
     sides: Mapping[str, Tensor]  # `topology`'s tables
-    cells: Mapping[str, Tensor]  # what a step needs of the boxes of objects with cells, see `tables`
+    cells: Mapping[str, Tensor]  # tables of the boxes of objects with cells, see `tables`
     boxes: Float[Tensor, "body 2 3"]  # lowest and highest corner of each body's box, (body, 2, 3) in its frame [m]
 
 
@@ -158,7 +158,7 @@ class ContactPatches(Request[ContactPatch]):
     # whether the area is the paper's polygon, through all points in the order of their angles about the centre, instead of
     # their convex hull
     is_star: bool
-    needs_stiffness: bool  # whether each object has to be of a material whose Young's modulus is known
+    needs_stiffness: bool  # whether each object's material needs a Young's modulus
 
     @property
     def wants_contacts(self) -> bool:  # type: ignore[override]
@@ -196,7 +196,7 @@ class PatchesUse(Generic[Array]):
     has_own_start: tuple[bool, ...]  # whether the state says at which temperature it begins
     num_materials: tuple[int, ...]  # how many materials it may have
     sides: Mapping[str, Array]  # the tables of `topology`
-    # what a step needs of the boxes of objects with cells, see `tables`; empty if there are none
+    # tables of the boxes of objects with cells, see `tables`; empty if there are none
     cells: Mapping[str, Array]
 
 
@@ -472,7 +472,7 @@ class ReferenceObject:
 
 @dataclass(frozen=True, eq=False)
 class ReferencePatches:
-    """All patches that there are, by (body, object), and what they are between."""
+    """All patches by (body, object), with the objects and the links' boxes."""
 
     patches: dict[tuple[int, int], ReferencePatch]
     objects: tuple[ReferenceObject, ...]

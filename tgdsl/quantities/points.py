@@ -59,8 +59,7 @@ class LinkPoints(NamedTuple):
     taxels: tuple[tuple[int, int], ...]  # first of each link's taxels, and one beyond the last
     tiles: Int[Tensor, "tile 3"]  # what `point_tiles` returns of them
     pos: Vec  # where they are now [m]; a compiler stores them
-    # signed distance to the link's own surface [m]; +∞ where the gate is closed, and maybe where it is beyond what the sensors
-    # asked for
+    # signed distance to the link's own surface [m]; +∞ where the gate is closed, and possibly beyond the requested distance
     distance: Tensor
     gradient: Vec  # its unit gradient
     area: Tensor  # surface of the object that each stands for [m²], (case, 1)

@@ -1,4 +1,4 @@
-"""A scene in float64, one environment at a time: what the references of quantities are computed from."""
+"""A scene in float64, one environment at a time, as the input of quantities' references."""
 
 from __future__ import annotations
 

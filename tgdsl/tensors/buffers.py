@@ -15,7 +15,7 @@ from tgdsl.tensors.torch_internals import HookedModule, buffers_of, mark_static
 
 
 class Constants(HookedModule):
-    """Arrays as buffers, by name. A change of dtype starts from the arrays' own float64, so that nothing is rounded twice.
+    """Arrays as buffers, by name. A change of dtype starts from the arrays' own float64, so no value is rounded twice.
 
     Attributes:
         tree: The result of `bind` on the buffers; rebuilt when they are replaced.

@@ -27,11 +27,11 @@ class Operation(Generic[P, R]):
     """A function of tensors: torch's operations define it, a Triton kernel stands in for them where it can."""
 
     name: str  # name of the custom operator that launches the kernel, in the namespace "tgdsl"
-    definition: Callable[P, R]  # what it is, in torch's operations; differentiable, for any device and dtype
+    definition: Callable[P, R]  # in torch's operations; differentiable, for any device and dtype
     # the same by the kernel. It imports the kernel's file in its body: Triton is neither installed everywhere nor imported in
     # an instant, and torch.compile traces an import statement, but no `importlib.import_module`.
     kernel: Callable[P, R]
-    inputs: Callable[P, Iterable[Tensor]]  # the tensors that have to be float32, on a GPU and without derivatives
+    inputs: Callable[P, Iterable[Tensor]]  # the tensors that must be float32, on a GPU and without derivatives
     condition: Callable[P, bool] | None = None  # further condition on the arguments; None: none
 
     def takes_kernel(self, *args: P.args, **kwargs: P.kwargs) -> bool:

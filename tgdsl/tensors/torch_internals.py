@@ -67,7 +67,7 @@ def held_buffers(module: nn.Module) -> dict[str, Tensor]:
 
 
 def mark_static(tensor: Tensor) -> None:
-    """Let torch.compile take a tensor's shape for a constant under dynamic shapes, as it does with a module's buffers.
+    """Let torch.compile treat a tensor's shape as constant under dynamic shapes, as it does for a module's buffers.
 
     This is `torch._dynamo.mark_static` without importing `torch._dynamo`, which takes seconds.
     """
@@ -132,8 +132,8 @@ def inductor_cache() -> Path:
 def with_own_code(method: Callable[..., Any]) -> Callable[..., Any]:
     """Return a bound method whose code object is a copy, so that torch.compile shares nothing between objects.
 
-    Dynamo keeps what it compiled of a method with its code object, for all objects together. It checks the guards of all of
-    these at each call, and refuses to compile for more than eight objects (`recompile_limit`).
+    Dynamo stores compiled code with the method's code object, for all objects together. It checks all of their guards at each
+    call, and refuses to compile for more than eight objects (`recompile_limit`).
     """
     assert isinstance(method, MethodType)
     function = method.__func__

@@ -87,7 +87,7 @@ def reference(
 
 
 def _shares(spec: ContactAudioSpec, modes: Ringing, loads: PairLoads) -> Float[np.ndarray, "body object mode"]:
-    """Return by how much more or less than by its gain each load strikes each mode of what it acts on."""
+    """Return the factor on each mode's gain for each load on a body."""
     if spec.gains == "mean":
         return np.ones((*loads.force.shape, 1))
     result = np.zeros((*loads.force.shape, modes.frequency.shape[1]))
@@ -132,7 +132,7 @@ def _driven(
 def _ring(
     rate: complex, phasor: complex, strikes: Strikes, samples: int, step: float, is_paper: bool
 ) -> tuple[Float[np.ndarray, " sample"], complex]:
-    """Return what a mode of gain 1 sounds like in a step, and its phasor at the end."""
+    """Return the samples of a mode of gain 1 in a step, and its phasor at the end."""
     if is_paper:
         return _two_pole(rate, phasor, strikes, samples, step)
     times = np.arange(1, samples + 1) * step / samples

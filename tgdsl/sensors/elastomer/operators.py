@@ -405,7 +405,7 @@ def fold_links(
         try:
             of_links.append(_fold_link(spec, layout, markers, i, surface_of))
         except LowerError as error:
-            field = error.field or "boundary"  # what a surface says knows no field
+            field = error.field or "boundary"  # errors of a surface have no field
             raise LowerError(f'link "{link.name}": {error.what}', field, error.hint) from error
     return {name: tuple(operators[name] for operators in of_links) for name in of_links[0]}
 
@@ -463,8 +463,8 @@ def _elastic_responses(
 
 
 def clamping(spec: ElastomerSpec, part: LinkTaxels, pad: Surface) -> Float[np.ndarray, "3 1 target source"]:
-    """Return what clamping the pad's edge adds to `spread`: the edge is moved back by as much as it would move."""
-    # Here, so that only who clamps a pad waits for scikit-fem, and a compiled module runs without it.
+    """Return the change of `spread` from a clamped edge: the edge's displacement is cancelled."""
+    # Imported here: only clamped pads need scikit-fem, and a compiled module runs without it.
     from tgdsl.sensors.elastomer.clamped.pad import correction, element_size, unroll
 
     assert spec.boundary is not None and spec.thickness is not None

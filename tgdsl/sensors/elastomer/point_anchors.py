@@ -203,7 +203,7 @@ SHEAR_LOADS = Operation("advance_anchors", shear_loads, _shear_loads_by_kernel, 
 def advance(
     of_objects: Sequence[LinkPoints], stick_slip: StickSlip, state: Mapping[str, Tensor]
 ) -> tuple[list[ShearLoad], dict[str, Tensor]]:
-    """Return what the points of each object load with, and the new anchors."""
+    """Return the shear loads of each object's points, and the new anchors."""
     loads, after, start = [], {name: [] for name in PLANES}, 0
     for points in of_objects:
         # Flat as the state is: a compiler then reads and writes that in one loop.

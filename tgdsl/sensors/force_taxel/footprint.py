@@ -57,7 +57,7 @@ class Footprint(NamedTuple):
     """How one body's contacts are shared out."""
 
     share: Float[Tensor, "*body contact taxel"]  # γ_c λ_cj, fraction of each contact's force on each taxel
-    # what the shares leave of the moment, Σ_c γ_c τ_c − Σ_c Σ_j γ_c λ_cj (x_j − x_c) × f_c, a couple [N·m]; planes (*body,)
+    # residual moment of the shares, Σ_c γ_c τ_c − Σ_c Σ_j γ_c λ_cj (x_j − x_c) × f_c, a couple [N·m]; planes (*body,)
     residual: Vec
 
 
@@ -73,7 +73,7 @@ def footprint(
     radius: Float[Tensor, "*padding"],
     levenberg: Float[Tensor, " iteration"],
 ) -> Footprint:
-    """Return the shares of contacts of bodies, and what they leave of the moment; derivatives are finite everywhere.
+    """Return the shares of contacts of bodies, and the residual moment; derivatives are finite everywhere.
 
     Args:
         pos: Taxel positions [m], planes (taxel,) or (body, taxel).
@@ -138,7 +138,7 @@ class Shared(NamedTuple):
 
     force: Float[Tensor, "env 3 taxel"]  # force on each taxel, Σ_c γ_c λ_cj f_c [N]
     missed: Float[Tensor, "env 3 body"]  # each body's net force less their sum over its taxels [N]
-    residual: Float[Tensor, "env 3 body"]  # what they leave of the moment [N·m]
+    residual: Float[Tensor, "env 3 body"]  # residual moment [N·m]
 
 
 def shared_forces(

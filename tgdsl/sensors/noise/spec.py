@@ -45,7 +45,7 @@ NO_AMPLITUDE: Amplitude = {ALL: ZERO}
 
 
 def quantity(channel: str) -> str:
-    """Return what a channel is a component of: `force` of `force_x`, else its own name; a distance is named by its object."""
+    """Return a channel's quantity: `force` for `force_x`, else its own name; a distance is named by its object."""
     is_component = channel[-2:] in ("_x", "_y", "_z") and not channel.startswith("distance_")
     return channel[:-2] if is_component else channel
 

@@ -372,7 +372,7 @@ are ten times slower."""
 
 
 class Neighbourhood(SpecModel):
-    """Mixing of neighbouring taxels of a link; the sum over its taxels stays what it is."""
+    """Mixing of neighbouring taxels of a link; the sum over its taxels is conserved."""
 
     strength: Share
     """χ, share of each taxel's signal that goes to its neighbourhood."""
@@ -407,7 +407,7 @@ class Crosstalk(Stage):
 
     @classmethod
     def constants(cls, values: Table, layout: Layout) -> dict[str, np.ndarray]:
-        """Return each link's W, (σ, from, to); where χ or σ is a range, G of the lower σ, and what the upper one adds."""
+        """Return each link's W, (σ, from, to); where χ or σ is a range, G of the lower σ and the change to the upper one."""
         result: dict[str, np.ndarray] = {}
         strength, (low, high) = values["crosstalk_strength"][:, 0], values["crosstalk_sigma"][:, 0]
         is_wider = bool((low != high).any())
@@ -454,7 +454,7 @@ def crosstalk_kernel(layout: Layout, sigma: Float[np.ndarray, " taxel"]) -> Floa
     """Return G (to, from), each column adding up to 1.
 
     Args:
-        layout: Taxels of one link; inactive ones keep what they have.
+        layout: Taxels of one link; inactive ones keep their signal.
         sigma: Standard deviation of each giver's neighbourhood [m].
     """
     apart = layout.pos[:, None] - layout.pos[None]

@@ -37,7 +37,7 @@ MOST_DENSE = {"cpu": 100, "cuda": 8}
 
 
 class Modes(NamedTuple):
-    """Modes along an axis: vectors (row, mode, cell); sums over the cells, and by what a is multiplied, (row, mode) each."""
+    """Modes along an axis: vectors (row, mode, cell); their sums over cells, and the factors of a in x, (row, mode) each."""
 
     vectors: Float[Tensor, "row mode cell"]
     totals: Float[Tensor, "row mode"]

@@ -97,7 +97,7 @@ def _coefficient(above: Tensor, surfaces: Surfaces) -> tuple[Tensor, Tensor]:
 
 
 def least_squared_wavenumber() -> float:
-    """Return what the paper calls ε, without a number [1/m²]."""
+    """Return the paper's ε, for which it gives no number [1/m²]."""
     return 1e-6
 
 

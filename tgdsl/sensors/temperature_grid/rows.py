@@ -177,7 +177,7 @@ def account(
     nodes_got: tuple[Tensor, ...],
     links: Tensor,
 ) -> tuple[Tensor, ...]:
-    """Return mean temperature [K], what they hold, and got from radiation, convection and contact [J], (env, object) each.
+    """Return mean temperature [K], stored heat, and heat from radiation, convection and contact [J], (env, object) each.
 
     Args:
         objects: Temperatures of their cells (env, object, x, y, z).

@@ -37,10 +37,10 @@ LARGEST_BLOCK = 2048  # rows × cells, each the next power of two, that the kern
 class Stepped(NamedTuple):
     """What a step does."""
 
-    cells: Tensor  # what the cells gain (env, row, x, y, z) [K]
-    nodes: Tensor  # what the nodes gain (env, node) [K]
-    got: tuple[Tensor, ...]  # what rows got from source, radiation, convection and contact (env, row) each [J]
-    nodes_got: tuple[Tensor, ...]  # what nodes got from radiation, convection and contact (env, node) each [J]
+    cells: Tensor  # gains of the cells (env, row, x, y, z) [K]
+    nodes: Tensor  # gains of the nodes (env, node) [K]
+    got: tuple[Tensor, ...]  # heat of rows from source, radiation, convection and contact (env, row) each [J]
+    nodes_got: tuple[Tensor, ...]  # heat of nodes from radiation, convection and contact (env, node) each [J]
 
 
 def step(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, constants: Constants, dt: Tensor) -> Stepped:
@@ -228,15 +228,15 @@ HEAT_STEP = Operation("heat_step", step, _by_kernel, _inputs, is_small)
 
 
 class Heat(NamedTuple):
-    """What there is after a step, above ambient."""
+    """Temperatures above ambient, and heat, after a step."""
 
-    cells: Tensor  # temperatures of the links' cells (env, link, x, y, z), and `cells_low` what these lack [K]
+    cells: Tensor  # temperatures of the links' cells (env, link, x, y, z); `cells_low` has their low parts [K]
     cells_low: Tensor  # see `cells`
     objects: Tensor  # the same of the objects' cells, (env, object, x, y, z); of an object of one temperature the first
-    objects_low: Tensor  # what these lack [K]
-    stored: Tensor  # what links hold (env, link) [J]
-    gained: tuple[Tensor, ...]  # what they got from source, radiation, convection and contact, (env, link) each [J]
-    # mean temperature [K], what they hold, and got from radiation, convection and contact [J], (env, object) each; empty
+    objects_low: Tensor  # low parts of the compensated sums [K]
+    stored: Tensor  # heat stored in links (env, link) [J]
+    gained: tuple[Tensor, ...]  # their heat from source, radiation, convection and contact, (env, link) each [J]
+    # mean temperature [K], stored heat, and heat from radiation, convection and contact [J], (env, object) each; empty
     # without objects
     of_objects: tuple[Tensor, ...]
 

@@ -469,7 +469,7 @@ def _below(offset):
 def _touched(
     free, phi, capacity, inverse, flow, shares, by_cell, by_side, sigma, begin, ROWS: tl.constexpr, PAIRS: tl.constexpr
 ):
-    """Return H and J of cells over their capacity (C, P) [K], and what the node gets (P) [J]: see `conduction`."""
+    """Return H and J of cells over their capacity (C, P) [K], and the node's heat (P) [J]: see `conduction`."""
     average, end = free
     over = 1.0 / capacity
     a, b, c, d = _response(by_cell, sigma[None, :])

@@ -210,7 +210,7 @@ def _laid(sheet: Sheet) -> Complex[np.ndarray, "f 3"]:
 
 
 def _angles(faces: Int[np.ndarray, "f 3"], laid: Complex[np.ndarray, "f 3"]) -> Float[np.ndarray, " f"]:
-    """Return by how much each triangle is to be turned so that neighbours agree on the direction of the edge they share."""
+    """Return the rotation of each triangle that makes neighbours agree on the direction of their shared edge."""
     direction = np.angle(np.roll(laid, -1, axis=1) - laid).ravel()
     side, twin = shared(faces).T
     count = len(faces)
