@@ -175,7 +175,7 @@ def test_mistakes(base, fails):
         ): 'tgdsl: there are no actions "zeros", expected zero, random, script or FILE.py:FUNCTION',
         ("task.yaml", "--actions", "act.py:down"): 'tgdsl: act.py: there is no function "down"; known functions: up\n',
         ("task.yaml", "--actions", "act.py:up"): "tgdsl: act.py:2: up: KeyError: 'gaol'\n",
-        ("task.yaml", "--actions", "script"): 'tgdsl: the task "in_palm_rotate" brings no script of its own',
+        ("task.yaml", "--actions", "script"): 'tgdsl: the task "in_palm_rotate" has no script',
         ("task.yaml", "--seconds", "0"): "tgdsl: played for 0 s: expected more than 0 s\n",
         ("task.yaml", "--seconds", "1e12"): "tgdsl: records of 16 environments at 40000000000000 steps need about ",
         ("task.yaml", "--envs", "0"): "tgdsl: num_envs is 0, expected a whole number of at least 1\n",

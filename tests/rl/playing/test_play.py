@@ -58,7 +58,7 @@ def test_a_script_is_given_the_environment_and_its_observations(env, script):
 
 
 def test_the_task_s_own_script(env, monkeypatch):
-    with pytest.raises(ScriptError, match='the task "in_palm_rotate" brings no script of its own'):
+    with pytest.raises(ScriptError, match='the task "in_palm_rotate" has no script'):
         actor_of(env, "script")
     monkeypatch.setattr(type(env.task), "script", lambda self, obs: -obs["proprio"][:, :2], raising=False)
     obs = env.step(torch.ones(NUM_ENVS, 2)).obs

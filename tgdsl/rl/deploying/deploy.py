@@ -33,8 +33,8 @@ from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.motion import MotionLimits
 
 EMULATED_LIMITS = {"speed": 1e6, "current_limit": 300, "kp": 100, "watchdog_s": 1.0}
-"""Limits of an emulated hand: its drives are those of the scene, and it is not to wait for them. Do not use these figures on a
-real one: what its gains do is not published."""
+"""Limits of an emulated hand, which need not wait for the scene's drives. Do not use these figures on a real hand: the effect
+of its gains is not published."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""How good a policy is: episodes without exploration, the same for all policies; and what may be required of it.
+"""Evaluation of a policy: episodes without exploration, the same for all policies; and requirements.
 
 Shapes: `env` environments.
 """
@@ -22,21 +22,21 @@ from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.gait import METRICS, SHARE, UNITS, Gait, GaitMeter
 from tgdsl.rl.playing.rollout import Actor, rollout
 
-SEED = 1_000_003  # what is random in the episodes follows from it, whatever a policy was learned with
+SEED = 1_000_003  # seed of the episodes, independent of a policy's training
 Z95 = 1.959963984540054
-CHECK_INTERVAL = 40  # control steps after which the host looks whether all episodes have ended
+CHECK_INTERVAL = 40  # control steps between the host's checks whether all episodes have ended
 DIMENSIONS = {"score": "number", "held": SHARE} | {name: dimension for name, (_, dimension) in METRICS.items()}
-"""What may be required of a policy: names of `Evaluation` and `Gait`, and what each is."""
+"""Quantities that requirements may name: fields of `Evaluation` and `Gait`, and their dimensions."""
 COMPARISONS: dict[str, Callable[[float, float], bool]] = {"<=": le, ">=": ge, "<": lt, ">": gt}
 _PART = re.compile(r"\s*(?P<name>[^\s<>=]+)\s*(?P<sign><=|>=|<|>)\s*(?P<value>[^<>=]+?)\s*\Z")
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How good a policy was in some episodes, the mean of each; intervals are of 95 %: Student's, and Wilson's of `held`.
+    """Means over some episodes of a policy, with 95 % intervals: Student's, and Wilson's of `held`.
 
-    `held` is the share of the episodes that lasted as long as one may, without a drop or whatever else ends them before;
-    `seconds` is their duration [s], `faults` how many a fault ended.
+    `held` is the share of episodes of full length, without a drop or another end; `seconds` is their duration [s], `faults` the
+    number of episodes that a fault ended.
     """
 
     task: str
@@ -54,7 +54,7 @@ class Evaluation:
     gait: Gait
 
     def plain(self) -> dict[str, Any]:
-        """Return plain values as JSON has them: None for what is not finite, such as the interval of one episode."""
+        """Return values for JSON: None instead of numbers that are not finite, such as the interval of one episode."""
         return _finite(asdict(self))
 
     def __str__(self) -> str:
@@ -132,7 +132,7 @@ def evaluate_each(
 
 @dataclass(frozen=True)
 class Requirement:
-    """One thing that is required of a policy, as in `coasting<0.1`: `name` is a key of `DIMENSIONS`, the bound in SI units."""
+    """A requirement such as `coasting<0.1`: `name` is a key of `DIMENSIONS`, the bound in SI units."""
 
     text: str
     name: str
@@ -149,7 +149,7 @@ class Requirement:
 
 
 def parse_requirements(text: str) -> list[Requirement]:
-    """Return what a text requires, its parts separated by commas: `coasting<0.1, penetration<2 mm, held>=95 %`."""
+    """Return the requirements of a text, separated by commas: `coasting<0.1, penetration<2 mm, held>=95 %`."""
     requirements = []
     for part in map(str.strip, text.split(",")):
         match = _PART.match(part)

@@ -1,23 +1,22 @@
-"""How a policy moves an object: whether it holds it or flicks it, and what hand and object bear.
+"""How a policy moves an object: whether it holds or flicks it, and the loads of hand and object.
 
-Of each control step one instant counts, that of the readings; the last one of an episode does not, as it begins the next one.
-With f_l the object's force on link l, Δψ what the step has brought (`Task.step_progress`), τ and q̇ torques and velocities of
-the joints that the policy moves, d_p the distance from probe p to the object, v and ω the object's velocity and angular
-velocity:
+Each control step counts by the instant of its readings, except an episode's last one, whose readings begin the next episode.
+With f_l the object's force on link l, Δψ the step's progress (`Task.step_progress`), τ and q̇ torques and velocities of the
+joints that the policy moves, d_p the distance from probe p to the object, v and ω the object's velocity and angular velocity:
 
     coasting         Σ max(0, Δψ) over instants at which no finger touches, as a share of Σ max(0, Δψ) over all
     untouched        share of instants at which no finger touches: |f_l| ≤ 0.01 N for each finger's link l
-    saturation       share of instants at which |τ_j| ≥ (0.98 S_j − ν) τ_max,j: of that joint with the largest
-    any_saturation   share of instants at which that is so for any joint
+    saturation       share of instants at which |τ_j| ≥ (0.98 S_j − ν) τ_max,j: of the joint with the largest share
+    any_saturation   share of instants at which any joint is saturated
     penetration      99th percentile of max_p (−d_p), where it is more than 0 [m]
     force            99th percentile of |f_l| over links and instants where it is more than 0.01 N [N]
     speed, spin      99th percentiles of |v| [m/s] and |ω| [rad/s]; max_speed, max_spin: the largest
-    joint_speed      99th percentile of |q̇_j| over its rated speed: of that joint with the largest [1]
+    joint_speed      99th percentile of |q̇_j| over its rated speed: of the joint with the largest one [1]
 
-with τ_max the largest torque, S the factor on it that was drawn, and ν the noise of torques: see `tgdsl.rl.actuation`.
+with τ_max the largest torque, S its random factor, and ν the noise of torques: see `tgdsl.rl.actuation`.
 
-Percentiles are those of histograms whose bins are 1 % wide. What a task does not have is None: progress, probes, links, limits
-of torques or speeds. The rated speed is that at which a joint's damping takes all of its largest torque.
+Percentiles come from histograms with bins 1 % wide. Quantities that a task lacks are None: progress, probes, links, limits of
+torques or speeds. At the rated speed a joint's damping takes all of its largest torque.
 
 Shapes: `env` environments, `link` links of `Setup.links`, `joint` joints that the policy moves.
 """

@@ -1,9 +1,9 @@
-"""A learned policy in a file, the card that says how it was learned, and how the card differs from the present task.
+"""A learned policy in a file, the card that describes its training, and differences between card and present task.
 
-The file is TorchScript, as rsl_rl's `export_policy_to_jit` writes it: it takes groups of observations side by side,
-(env, feature), and returns actions, (env, joint). rsl_rl does not write which groups: they are those of the actor, in the order
-of the runner's `obs_groups`. What `tgdsl train` writes has a card that names them. Weights may be stored in float16: they are
-float32 in the module that is read.
+The file is TorchScript, as rsl_rl's `export_policy_to_jit` writes it: it takes concatenated groups of observations,
+(env, feature), and returns actions, (env, joint). rsl_rl's files do not name the groups: they are the actor's, in the order of
+the runner's `obs_groups`. Files of `tgdsl train` have a card that names them. Weights may be stored in float16: the loaded
+module has float32.
 
 Shapes: `env` environments, `joint` joints that the policy moves, `feature` numbers of a group.
 """
@@ -44,7 +44,7 @@ from tgdsl.rl.sensed import GROUP, sensors_document
 from tgdsl.rl.spec import TaskSpec
 
 ELSEWHERE = {"tgdsl", "robot", "scene", "resolution", "observations"}
-"""What of a sensors' document is compared by joints, taxels and scene, and what the task's document says."""
+"""Keys of a sensors' document that are compared by joints, taxels and scene, or that the task's document sets."""
 SCENE = {
     "gravity": ("opt.gravity",),
     "bodies": ("body_mass", "body_inertia", "body_ipos", "body_pos", "body_quat"),
@@ -61,12 +61,12 @@ SCENE = {
     ),
     "actuators": ("actuator_gainprm", "actuator_biasprm", "actuator_ctrlrange", "actuator_forcerange"),
 }
-"""Arrays of MuJoCo's model by what they are of."""
-LEAST = 1e-12  # what counts as 0, in the array's unit: rounding differs between machines
+"""Arrays of MuJoCo's model by part of the scene."""
+LEAST = 1e-12  # magnitude that counts as 0, in the array's unit: rounding differs between machines
 
 
 def provenance(loaded: LoadedTask, model: mujoco.MjModel) -> dict[str, Any]:
-    """Return what a card says of sensors and scene, as plain values."""
+    """Return a card's entries for sensors and scene, as plain values."""
     spec = sensors_document(loaded).spec
     return {
         "sensors": spec.model_dump(mode="json", exclude=ELSEWHERE),
@@ -75,19 +75,19 @@ def provenance(loaded: LoadedTask, model: mujoco.MjModel) -> dict[str, Any]:
 
 
 def changes_around(card: Mapping[str, Any], loaded: LoadedTask, model: mujoco.MjModel) -> list[str]:
-    """Return what of sensors and scene is otherwise than where a policy was learned, a line each; nothing of older cards."""
+    """Return changes of sensors and scene since a policy was learned, a line each; none for older cards."""
     if "sensors" not in card:
         return []
-    now, scene = provenance(loaded, model), card["scene"]
-    lines = differences(card["sensors"], _known(card["sensors"], now["sensors"]))
+    present, scene = provenance(loaded, model), card["scene"]
+    lines = differences(card["sensors"], _with_keys_of(card["sensors"], present["sensors"]))
     results = [f"{loaded.spec.document}: {line}" for line in lines]
-    return results + [f"the scene's {part}" for part, digest in now["scene"].items() if scene.get(part, digest) != digest]
+    return results + [f"the scene's {part}" for part, digest in present["scene"].items() if scene.get(part, digest) != digest]
 
 
-def _known(before: Any, now: Any) -> Any:
-    if not (isinstance(before, dict) and isinstance(now, dict)):
-        return now
-    return {name: _known(before[name], value) for name, value in now.items() if name in before}
+def _with_keys_of(saved: Any, present: Any) -> Any:
+    if not (isinstance(saved, dict) and isinstance(present, dict)):
+        return present
+    return {name: _with_keys_of(saved[name], value) for name, value in present.items() if name in saved}
 
 
 def _digest(model: mujoco.MjModel, names: tuple[str, ...]) -> str:
@@ -112,7 +112,7 @@ def differences(before: Any, now: Any, path: str = "") -> list[str]:
 
 
 def is_close(one: Any, other: Any) -> bool:
-    """Return whether plain values are equal, numbers but for rounding: 0.7 cm are not quite 7 mm."""
+    """Return whether plain values are equal, numbers up to rounding: 0.7 cm is not exactly 7 mm."""
     if isinstance(one, dict) and isinstance(other, dict):
         return one.keys() == other.keys() and all(is_close(value, other[name]) for name, value in one.items())
     if isinstance(one, list | tuple) and isinstance(other, list | tuple):
@@ -133,29 +133,29 @@ def spec_differences(
 
 
 ACTOR_GROUPS = ("proprio", "tactile_sensors", "goal")
-"""Groups that a policy sees unless others are named: of these, those that there are."""
+"""Groups that a policy sees by default, if they exist."""
 
 
 OF_LEARNING, OF_TOUCH = ("train", "distill"), ("touch", "placement", "resolution", "noise")
-"""What of a document matters to those alone who learn, and to those alone who feel."""
+"""Keys of a document that matter only for learning, and only for touch."""
 POLICY = "policy.pt"  # name of a run's policy in its folder
 CARD = "card.json"  # name of the card in the file
 TAXELS = "taxels.csv"  # name of the table of taxels in the file
 
 
 class PolicyError(TgdslError):
-    """A policy that cannot be read, or that is of other sizes than the environments."""
+    """A policy that cannot be read, or that does not fit the environments."""
 
 
 @dataclass(frozen=True, eq=False)
 class PolicyFile:
-    """A policy's file as it was when it was read; what is written into it later is another policy."""
+    """A snapshot of a policy's file, unaffected by later writes."""
 
     file: Path  # the file
     content: bytes  # its bytes
     card: dict[str, Any] | None  # its card; None: it has none
     taxels: Mapping[str, Columns]
-    """The taxels that it feels with by sensor, as `TactileModule.taxels` has them; empty if the file lists none."""
+    """Taxels of its touch by sensor, as in `TactileModule.taxels`; empty if the file lists none."""
 
     def module(self, device: torch.device | str) -> torch.jit.ScriptModule:
         """Return the TorchScript module on a device."""
@@ -177,7 +177,7 @@ def read_policy(file: Path) -> PolicyFile:
         archive = io.BytesIO(content)
         files = {Path(name).name for name in ZipFile(archive).namelist()} if is_zipfile(archive) else set()
         if "data.pkl" in files and "constants.pkl" not in files:  # `torch.save`, where TorchScript has a file of constants
-            policy = f"the policy of a run is its {POLICY}, that of rsl_rl's runner what `export_policy_to_jit` writes"
+            policy = f"the policy of a run is its {POLICY}; rsl_rl's runner writes one with `export_policy_to_jit`"
             raise PolicyError(f"{file}: this is a checkpoint, from which learning goes on; {policy}") from error
         if file.suffix == ".onnx":
             raise PolicyError(f"{file}: this is the ONNX form of a policy, expected the {POLICY} beside it") from error
@@ -188,7 +188,7 @@ def read_policy(file: Path) -> PolicyFile:
 
 
 def write_policy(scripted: torch.nn.Module, texts: Mapping[str, str], file: Path) -> None:
-    """Write a policy as TorchScript with its `card_texts` in it, and the card beside it."""
+    """Write a policy as TorchScript with its `card_texts` in it, and the card as a JSON file."""
     content = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # TorchScript itself
@@ -198,7 +198,7 @@ def write_policy(scripted: torch.nn.Module, texts: Mapping[str, str], file: Path
 
 
 def card_texts(touch: TactileModule, card: Mapping[str, Any]) -> dict[str, str]:
-    """Return the texts that a policy's file holds, by name: its card, and the taxels that it feels with."""
+    """Return the texts in a policy's file by name: its card, and the taxels of its touch."""
     return {CARD: json.dumps(card, indent=2, ensure_ascii=False, allow_nan=False) + "\n", TAXELS: taxel_csv(touch)}
 
 
@@ -218,7 +218,7 @@ def taxel_csv(touch: TactileModule) -> str:
 
 
 def taxel_tables(text: str) -> dict[str, Columns]:
-    """Return the taxels of each sensor of what `taxel_csv` returned."""
+    """Return the taxels of each sensor from a text of `taxel_csv`."""
     rows, tables = list(csv.DictReader(io.StringIO(text))), dict[str, Columns]()
     for sensor in dict.fromkeys(row["sensor"] for row in rows):
         columns = {name: np.array([row[name] for row in rows if row["sensor"] == sensor]) for name in rows[0]}
@@ -244,13 +244,13 @@ def actor_groups(
 class Policy(Actor):
     """A learned policy that acts in some environments: takes `groups` of observations, in their order.
 
-    `std` is the standard deviation of its actions while it was learned, None if its card does not have it.
+    `std` is the standard deviation of its actions in training, None if its card lacks it.
     """
 
     def __init__(
         self, saved: PolicyFile, groups: Mapping[str, int], num_envs: int, num_actions: int, device: torch.device | str = "cpu"
     ):
-        """See that a policy fits; raise `PolicyError` if it does not fit."""
+        """Check a policy; raise `PolicyError` if it does not fit."""
         self.groups = tuple(groups)
         self._module, card, file = saved.module(device), saved.card, saved.file
         std = (card or {}).get("std")
@@ -300,15 +300,15 @@ def policy_for(env: TouchEnv, saved: PolicyFile, named: Sequence[str] = ()) -> P
 
 
 def changes_since(card: Mapping[str, Any], spec: TaskSpec, leave_out: tuple[str, ...] = ()) -> list[str]:
-    """Return what of a task's document is otherwise than where a policy was learned, a line each."""
+    """Return changes of a task's document since a policy was learned, a line each."""
     unfelt = () if GROUP in card["groups"] else OF_TOUCH
     return spec_differences(card["spec"], spec.model_dump(mode="json"), type(spec), (*OF_LEARNING, *unfelt, *leave_out))
 
 
 def check_learned(card: Mapping[str, Any], file: Path, spec: TaskSpec, who: str = "policy") -> None:
-    """See that a policy was learned in a task, with its actions and control steps; raise `PolicyError` if not."""
+    """Check that a policy was learned in a task, with its actions and control steps; raise `PolicyError` if not."""
     theirs, ours = dict(card["spec"]), spec.model_dump(mode="json")
-    with suppress(ValidationError):  # what is no action here differs
+    with suppress(ValidationError):  # an invalid action differs anyway
         theirs["action"] = type(spec.action).model_validate(theirs["action"]).model_dump(mode="json")  # of today's fields
     if _without_folder(theirs["task"]) != _without_folder(ours["task"]):
         raise PolicyError(f'{file}: this {who} was learned in the task "{theirs["task"]}", not "{ours["task"]}"')
@@ -329,7 +329,7 @@ def _summands(groups: Mapping[str, int]) -> str:
 
 
 def _is_in_order(card: Mapping[str, int], groups: Mapping[str, int]) -> bool:
-    """Whether groups equal a card's, in its order; the group of touch may be named as `Felt.group` does."""
+    """Whether groups equal a card's, in its order; the touch group may have the name of `Felt.group`."""
     pairs = zip(card.items(), groups.items(), strict=False)
     return len(card) == len(groups) and all(
         size == result and (name == other or (name == GROUP and other.startswith(f"{GROUP}/")))
@@ -338,10 +338,10 @@ def _is_in_order(card: Mapping[str, int], groups: Mapping[str, int]) -> bool:
 
 
 def check_card(saved: PolicyFile, joints: Sequence[str], touch: HasPlan) -> None:
-    """See that a policy with a card is for what the environments have.
+    """Check that a policy with a card fits the environments' joints and taxels.
 
-    Taxels may differ by rounding, as those of a robot that was exported do. Sensors that the environments lack, such as those
-    that only the task reads, are not compared.
+    Taxels may differ by rounding, as after a robot's export. Sensors that the environments lack, such as sensors that only the
+    task reads, are not compared.
     """
     card, file = saved.card, saved.file
     assert card is not None
@@ -357,7 +357,7 @@ def check_card(saved: PolicyFile, joints: Sequence[str], touch: HasPlan) -> None
 
 
 def _module(content: bytes, device: torch.device | str, extra_files: dict[str, Any] | None = None) -> torch.jit.ScriptModule:
-    """Return the module that a TorchScript file holds, float16 weights as float32; `extra_files` are filled in."""
+    """Return the module of a TorchScript file, float16 weights as float32; `extra_files` are filled in."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # TorchScript itself, which rsl_rl writes
         module = torch.jit.load(io.BytesIO(content), map_location=device, _extra_files=extra_files).eval()
@@ -368,7 +368,7 @@ def _module(content: bytes, device: torch.device | str, extra_files: dict[str, A
 
 
 def write_onnx_policy(network: Any, texts: dict[str, str], file: Path) -> None:
-    """Write a policy."""
+    """Write a policy as ONNX."""
     module = network.cpu().eval().requires_grad_(False)
     inputs = network.get_dummy_inputs()
     env = torch.export.Dim("env", min=1)

@@ -23,7 +23,7 @@ Column = Shaped[np.ndarray, "row ..."]
 
 
 class Record:
-    """Columns to which rows are added, and which are written with the names of the joints that the policy moves."""
+    """Columns that grow by rows, written with the names of the joints that the policy moves."""
 
     def __init__(self, joints: Sequence[str]):
         self.joints = tuple(joints)
@@ -41,7 +41,7 @@ class Record:
             self._columns.setdefault(name, []).append(rows)
 
     def write(self, path: Path, **words: str) -> None:
-        """Write the file; it appears whole or not at all."""
+        """Write the file atomically."""
         columns = {name: self[name] for name in self._columns} | {"joints": np.array(self.joints)}
         with atomic_open(with_folder(path)) as file:
             np.savez_compressed(file, **columns, **{name: np.array(word) for name, word in words.items()})  # type: ignore[arg-type]
@@ -52,11 +52,11 @@ class PlayRecord(Record):
 
     The file holds, of each control step, its start's `time` (step,) [s], the observations `obs:<group>` (step, env, feature)
     that the action was chosen from, `qpos` (step, env, nq) at the start of the step, where there are mocap bodies `mocap_pos`
-    (step, env, body, 3) and `mocap_quat` (step, env, body, 4), the `action` (step, env, joint); and what came of it: `reward`,
+    (step, env, body, 3) and `mocap_quat` (step, env, body, 4), the `action` (step, env, joint); and its results: `reward`,
     `term:<name>` (weight and Δt included), `score`, `terminated`, `truncated`, `fault`, (step, env) each. Observations are of
-    one physics step before the start, but for the first of an episode. Of each episode that has ended it holds `ended:step`,
-    `ended:env`, `ended:return`, `ended:steps`, `ended:score` (episode,) and its last observations `ended:obs:<group>`
-    (episode, feature). `joints` and `score_unit` say what joints and scores are.
+    one physics step before the start, except the first of an episode. Of each ended episode it holds `ended:step`, `ended:env`,
+    `ended:return`, `ended:steps`, `ended:score` (episode,) and its last observations `ended:obs:<group>` (episode, feature).
+    `joints` has the names of the joints, `score_unit` the unit of scores.
     """
 
     def __init__(self, env: TouchEnv, num_steps: int):
@@ -71,11 +71,11 @@ class PlayRecord(Record):
         self._poses = self._copied_poses()
 
     def poses(self, env: int) -> dict[str, Float[np.ndarray, "step ..."]]:
-        """Return where everything was before each step in one environment, by MuJoCo's names."""
+        """Return the poses before each step in one environment, by MuJoCo's names."""
         return {name: self[name][:, env] for name in self._live}
 
     def add(self, moment: Moment) -> None:
-        """Add a control step, right after it was made."""
+        """Add a control step, before the next one."""
         step, info = moment.step, moment.step.info
         values = {f"obs:{group}": value for group, value in moment.obs.items()} | {"action": moment.action}
         values |= {"reward": step.reward, **{f"term:{name}": value for name, value in info.terms.items()}}
@@ -103,7 +103,7 @@ def _numpy(tensor: Tensor) -> np.ndarray:
 
 
 class Tally:
-    """A table of means over environments: of the present episodes so far, and of those that have ended."""
+    """A table of means over environments: of the present episodes so far, and of ended episodes."""
 
     def __init__(self, env: TouchEnv):
         self._env = env

@@ -1,4 +1,4 @@
-"""The loop in which a policy acts, in environments and on a hand or a log; actors that nobody has learned.
+"""The loop in which a policy acts, in environments and on a hand or a log; actors without learning.
 
 Shapes: `env` environments, `joint` joints that the policy moves, `feature` numbers of a group.
 """
@@ -23,23 +23,23 @@ from tgdsl.rl.env import Observations, Step, TouchEnv
 
 
 class Actor(ABC):
-    """Who acts in environments."""
+    """A source of actions in environments."""
 
-    changes: Sequence[str] = ()  # what of the task was otherwise when that was learned, a line each
+    changes: Sequence[str] = ()  # changes of the task since the actor was learned, a line each
 
     @abstractmethod
     def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
         """Return actions, from −1 to 1, for observations by group."""
 
     def begin(self, ended: Bool[Tensor, " env"]) -> None:  # noqa: B027
-        """Forget what is remembered of episodes that have ended; most remember nothing."""
+        """Reset the memory of ended episodes; most actors have none."""
 
 
 class Environments(Protocol):
     """Where a policy acts: a `TouchEnv`, or one hand."""
 
     def observe(self) -> Observations:
-        """Return what is observed now, by group."""
+        """Return the present observations, by group."""
         ...
 
     def step(self, action: Float[Tensor, "env joint"]) -> Step:
@@ -52,13 +52,13 @@ class Moment:
     """One control step of a policy."""
 
     index: int  # its number, from 0
-    obs: Mapping[str, Float[Tensor, "env feature"]]  # observations that the action was chosen from, by group
+    obs: Mapping[str, Float[Tensor, "env feature"]]  # observations before the action, by group
     action: Float[Tensor, "env joint"]  # the action
-    step: Step  # what came of it
+    step: Step  # its result
 
 
 def rollout(actor: Actor, env: Environments, num_steps: int | None = None) -> Iterator[Moment]:
-    """Let an actor act from where the environments are, and yield each control step."""
+    """Let an actor act from the environments' present state, and yield each control step."""
     for index in count() if num_steps is None else range(num_steps):
         obs = env.observe()
         action = actor(obs)
@@ -68,7 +68,7 @@ def rollout(actor: Actor, env: Environments, num_steps: int | None = None) -> It
 
 
 def steps_of(env: TouchEnv, seconds: float | None) -> int:
-    """Return how many control steps a duration has, at least one; default: an episode's."""
+    """Return the number of control steps of a duration, at least one; default: an episode's."""
     if seconds is None:
         return env.max_steps
     if not 0 < seconds < float("inf"):
@@ -76,7 +76,7 @@ def steps_of(env: TouchEnv, seconds: float | None) -> int:
     return max(1, round(seconds / env.control_step))
 
 
-KINDS = ("zero", "random", "script")  # actions by one word; else they are a function of a file, `FILE.py:FUNCTION`
+KINDS = ("zero", "random", "script")  # actions by one word; others are a function of a file, `FILE.py:FUNCTION`
 ScriptFunction = Callable[[TouchEnv, Mapping[str, Tensor]], Any]
 """Takes an environment and its observations by group, and returns actions (env, joint)."""
 
@@ -96,7 +96,7 @@ class ZeroActor(Actor):
 
 
 class RandomActor(Actor):
-    """Returns numbers from −1 to 1, the same for an environment however many there are."""
+    """Returns random numbers from −1 to 1, independent of the number of environments."""
 
     def __init__(self, env: TouchEnv, seed: int):
         self._draws = Draws(seed, env.num_envs, env.device)
@@ -109,7 +109,7 @@ class RandomActor(Actor):
 
 
 class ScriptActor(Actor):
-    """Returns what a function of the environment and its observations does; `file` is where errors look for the line."""
+    """Returns the actions of a function of the environment and its observations; errors name the line in `file`."""
 
     def __init__(self, env: TouchEnv, function: ScriptFunction, name: str, file: str = ""):
         self._env, self._function, self._name, self._file = env, function, name, file
@@ -140,12 +140,12 @@ def actor_of(env: TouchEnv, actions: str, seed: int = 0) -> Actor:
         return ScriptActor(env, *_script_of(actions))
     script = getattr(env.task, "script", None)
     if script is None:
-        raise ScriptError(f'the task "{env.spec.task}" brings no script of its own; name one as FILE.py:FUNCTION')
+        raise ScriptError(f'the task "{env.spec.task}" has no script; name one as FILE.py:FUNCTION')
     return ScriptActor(env, lambda _, obs: script(obs), f"the script of {env.spec.task}")
 
 
 def check_actions(actions: str) -> None:
-    """Raise `ScriptError` if there is no such script, before an environment is made."""
+    """Raise `ScriptError` if a script does not exist; needs no environment."""
     if actions not in KINDS:
         _script_of(actions)
 

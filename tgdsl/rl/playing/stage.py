@@ -1,4 +1,4 @@
-"""A task's environments on the live page: an actor acts, and reward terms are written beside what is felt."""
+"""A task's environments on the live page: an actor acts, and reward terms are shown with the touch."""
 
 from __future__ import annotations
 

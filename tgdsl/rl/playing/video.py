@@ -29,11 +29,11 @@ Frame = UInt8[np.ndarray, "row column 3"]
 
 
 class VideoError(TgdslError):
-    """A video that cannot be made here."""
+    """A video that cannot be rendered or encoded here."""
 
 
 def check_camera(model: mujoco.MjModel, camera: str | None) -> None:
-    """See that a scene has a camera; raise `VideoError` if it has not."""
+    """Raise `VideoError` if a scene lacks a camera."""
     names = [model.camera(i).name for i in range(model.ncam)]
     if camera is not None and camera not in names:
         raise VideoError(f'the scene has no camera "{camera}"; {did_you_mean(camera, names, "cameras")}')
@@ -89,7 +89,7 @@ def _renderer(model: mujoco.MjModel) -> mujoco.Renderer:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of GLFW, which then raises as well
             return mujoco.Renderer(drawn, height=HEIGHT, width=WIDTH)
-    except Exception as error:  # each of MuJoCo's ways to OpenGL raises errors of its own
+    except Exception as error:  # each of MuJoCo's OpenGL backends raises different errors
         problem = f"OpenGL cannot be started ({type(error).__name__}: {error})"
         raise VideoError(f"{problem}; without a display set the environment variable MUJOCO_GL to egl or osmesa") from error
 

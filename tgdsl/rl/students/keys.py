@@ -1,4 +1,4 @@
-"""Who is taught, and by whom: students, one per type, placement, noise and seed, each in its block; and their teacher.
+"""Students, one per type, placement, noise and seed, each in its block of environments; and their teacher.
 
 Shapes: `feature` numbers of a group.
 """
@@ -33,23 +33,23 @@ from tgdsl.rl.spec import PushSpec, touch_types
 from tgdsl.rl.students.spec import StudentNetworksSpec
 from tgdsl.rl.students.student import Architecture, Encoder, Grid
 
-NONE = "none"  # the type that feels nothing
+NONE = "none"  # the type without touch
 
 
 class StudentError(TgdslError):
-    """Students that cannot be dealt out."""
+    """Students that cannot be created or assigned to environments."""
 
 
 @dataclass(frozen=True)
 class StudentKey:
-    """A student: what it feels (None: nothing), and the seed of its first weights."""
+    """A student: its touch (None: without), and the seed of its initial weights."""
 
     felt: Felt | None
     seed: int
 
     @property
     def kind(self) -> tuple[str, str, str]:
-        """Type, placement and noise; the latter two are empty of one that feels nothing."""
+        """Type, placement and noise; the latter two are empty without touch."""
         return (NONE, "", "") if self.felt is None else (self.felt.type, self.felt.placement, self.felt.noise)
 
     @property
@@ -59,7 +59,7 @@ class StudentKey:
 
 
 def student_keys(types: Sequence[str], placements: Sequence[str], noises: Sequence[str], seeds: int) -> list[StudentKey]:
-    """Return a student per type, placement, noise and seed; of those that feel nothing, one per seed."""
+    """Return a student per type, placement, noise and seed; without touch, one per seed."""
     all_types = [NONE, *touch_types()]
     selected = [name for type_ in types for name in (all_types if type_ == "all" else [type_])]
     for name in selected:
@@ -82,17 +82,17 @@ def student_keys(types: Sequence[str], placements: Sequence[str], noises: Sequen
     for key in (StudentKey(felt, seed) for felt in dict.fromkeys(felts) for seed in range(seeds)):
         if (other := keys.setdefault(key.name, key)) is not key:
             both = " and ".join(" ".join(part for part in each.kind if part) for each in (other, key))
-            raise StudentError(f"two students would have the name {key.name}: those of {both}")
+            raise StudentError(f"two students would have the name {key.name}: {both}")
     return list(keys.values())
 
 
 def feels(dealt: Sequence[StudentKey], also: Felt | None = None) -> list[Felt]:
-    """Return all that is felt, each once; `also` by a teacher."""
+    """Return the touch of all students and a teacher (`also`), each once."""
     return list(dict.fromkeys(felt for felt in (*(key.felt for key in dealt), also) if felt is not None))
 
 
 def check_blocks(num_envs: int, num_students: int, num_variants: int) -> None:
-    """See that environments divide into blocks in which all variants of the object are, equally often."""
+    """Check that environments divide into blocks with equal numbers of all variants of the object."""
     unit = num_students * num_variants
     if num_envs % unit:
         of = f", {num_variants} variants of the object in the environments of each" if num_variants > 1 else ""
@@ -102,7 +102,7 @@ def check_blocks(num_envs: int, num_students: int, num_variants: int) -> None:
 
 
 def groups_of(loaded: LoadedTask, groups: Mapping[str, int]) -> list[str]:
-    """Return the groups of observations that all students see, with `tactile_sensors` where touch stands among them."""
+    """Return the groups of observations that all students see, with `tactile_sensors` at the place of touch."""
     named = loaded.spec.distill.groups
     other_groups = [name for name in groups if not name.startswith(f"{GROUP}/")]
     if problems := wrong_groups(loaded.source, {("distill", "groups"): named}, other_groups):
@@ -119,7 +119,7 @@ def seen_by(key: StudentKey, names: Sequence[str]) -> list[str]:
 
 
 def architecture(loaded: LoadedTask, env: TouchEnv, key: StudentKey, names: Sequence[str]) -> Architecture:
-    """Return a student's networks: students whose networks are equal are stacked."""
+    """Return a student's networks: students with equal networks are stacked."""
     networks, parts = loaded.spec.distill.networks, []
     for name in seen_by(key, names):
         size = env.groups[name]
@@ -142,7 +142,7 @@ def _touch_encoder(networks: StudentNetworksSpec, felt: Felt, layout: Layout, si
 
 
 def grid_of(layout: Layout, size: int, felt: Felt) -> Grid:
-    """Return where the taxels of a group stand in images; raise `StudentError` if the taxels of a link are on no grid."""
+    """Return the places of a group's taxels in images; raise `StudentError` if a link's taxels are on no grid."""
     try:
         images = image_indices(layout)
     except TgdslError as error:
@@ -157,14 +157,14 @@ def grid_of(layout: Layout, size: int, felt: Felt) -> Grid:
     return Grid(size // layout.num_taxels, layout.num_taxels, shape, tuple(cells.ravel().tolist()))
 
 
-WARM_CALLS = 3  # calls in which TorchScript optimises a policy, before one is captured on a GPU
+WARM_CALLS = 3  # calls in which TorchScript optimises a policy before its capture on a GPU
 
 
 class Teacher:
-    """A learned policy, seen to be of this task: its file, its card, and what it feels; None: nothing."""
+    """A learned policy, checked against this task: its file, its card, and its touch (`felt`; None: without)."""
 
     def __init__(self, file: Path, loaded: LoadedTask):
-        """Read it, and see that it is for this task and these actions."""
+        """Read it, and check that it is for this task and these actions."""
         self.saved, self._loaded = read_policy(file), loaded
         card = self.saved.card
         if card is None:
@@ -184,7 +184,7 @@ class Teacher:
         self.changes = changes_since(card, loaded.spec, OF_TOUCH)
 
     def check_taxels(self) -> None:
-        """See that a teacher that feels does so with the taxels that there are now; raise `PolicyError` if they are others."""
+        """Raise `PolicyError` if a teacher with touch was learned with other taxels."""
         if self.felt is not None:
             touch = compile_sensed(own_task(self._loaded, self.felt), "cpu").touch
             check_card(self.saved, self.card["joints"], touch)
@@ -212,7 +212,7 @@ class Teacher:
 
 
 def students_task(loaded: LoadedTask) -> LoadedTask:
-    """Return the task in which students are taught: without pushes if its document says so."""
+    """Return the students' task: without pushes if its document says so."""
     if loaded.spec.distill.pushes:
         return loaded
     randomise = loaded.spec.randomise.model_copy(update={"push": PushSpec()})
@@ -220,6 +220,6 @@ def students_task(loaded: LoadedTask) -> LoadedTask:
 
 
 def own_task(loaded: LoadedTask, felt: Felt | None) -> LoadedTask:
-    """Return the task of a policy that feels one thing, in environments of its own."""
+    """Return the task of a policy with one kind of touch, in separate environments."""
     touch = {"touch": "none"} if felt is None else {"touch": felt.type, "placement": felt.placement, "noise": felt.noise}
     return dataclasses.replace(loaded, spec=loaded.spec.model_copy(update=touch))

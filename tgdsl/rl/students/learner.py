@@ -1,17 +1,17 @@
-"""DAgger: students act, each in its block of environments, and learn what the teacher would have done there.
+"""DAgger: students act, each in its block of environments, and learn the teacher's actions there.
 
 An iteration is a rollout of `steps` control steps and `epochs` passes through it, a gradient step per `gradient_length` control
-steps. On a GPU, who acts and each pass are CUDA graphs.
+steps. On a GPU, acting and each pass are CUDA graphs.
 
 With a_s a student's action, a_t the teacher's, σ_t the standard deviation of the teacher's exploration (`inverse_variance`) or
-actions (`normalise`), else 1, a_0 what the student asked for in the rollout (in an earlier one that is kept: would ask for when
-the pass begins), a_c = a_0 + clamp(a_s − a_0, ±clip), and h(e) = e², or for `huber` e² up to |e| = 1 and 2|e| − 1 beyond:
+actions (`normalise`), else 1, a_0 the student's action in the rollout (in a stored earlier one: with the weights at the start
+of the pass), a_c = a_0 + clamp(a_s − a_0, ±clip), and h(e) = e², or for `huber` e² up to |e| = 1 and 2|e| − 1 beyond:
 
     action error     mean of h((a_s − a_t)/σ_t);  with a clip, of max(h((a_s − a_t)/σ_t), h((a_c − a_t)/σ_t))
     decoder k        w_k · mean of (d_k − s_k y_k)²,  y_k being the privileged number
 
 Source: Chung et al., *Tactile Genesis*, appendix. It names the loss, "inv-var MSE", and a clip parameter of 0.1; the formulas
-are ours: σ_t² as the variance, and the clip as PPO bounds values. Normalised actions and Huber's loss are of the authors'
+are ours: σ_t² as the variance, and the clip as PPO bounds values. Normalised actions and Huber's loss follow the authors'
 public code: see docs/records/paper.md; its bound of 1 is ours.
 
 Shapes: `env` environments, `student` students of a stack, `row` environments of a block, `joint`, `target` as in `student.py`.
@@ -74,11 +74,11 @@ def decoder_error(
     return ((output - scales * targets).square().mean(dim=1) * weights).sum(dim=1)
 
 
-LEAST_STD = 1e-3  # least deviation of the teacher's actions by which an error is divided
+LEAST_STD = 1e-3  # least deviation of the teacher's actions that divides an error
 
 
 class Rollout:
-    """Students of one stack in the blocks of `rows` environments that begin with environment `first`; `seen` by each."""
+    """Students of one stack in blocks of `rows` environments from `first` on; `seen`: each one's groups."""
 
     def __init__(
         self,
@@ -93,7 +93,7 @@ class Rollout:
         self.keys, self.seen, self.first, self.rows = keys, seen, first, rows
         self.stack = Stack(networks, [key.seed for key in keys], spec.learning_rate, spec.max_grad_norm, device)
         shape = (len(keys), rows)
-        # what they remember now, and remembered at the start of the rollout: (student, row, memory)
+        # their memory now, and at the start of the rollout: (student, row, memory)
         self.memory, self.begun = (torch.zeros((*shape, self.stack.memory), device=device) for _ in range(2))
         # their observations and actions in the rollout: (step, student, row, …)
         self.x = torch.zeros((spec.steps, *shape, networks.num_features), device=device)
@@ -105,19 +105,19 @@ class Rollout:
         return slice(self.first, self.first + self.rows * len(self.keys))
 
     def split(self, values: Tensor, dim: int = 0) -> Tensor:
-        """Return what is of each environment, (…, env, …), as (…, student, row, …)."""
-        own = values.narrow(dim, self.first, self.rows * len(self.keys))
-        return own.unflatten(dim, (len(self.keys), self.rows))
+        """Return values per environment, (…, env, …), as (…, student, row, …)."""
+        selected = values.narrow(dim, self.first, self.rows * len(self.keys))
+        return selected.unflatten(dim, (len(self.keys), self.rows))
 
     def inputs(self, obs: Mapping[str, Tensor]) -> Tensor:
-        """Return what each student sees: of its own environments its own groups, (student, row, feature)."""
+        """Return each student's observations: its groups in its environments, (student, row, feature)."""
         blocks = [slice(self.first + i * self.rows, self.first + (i + 1) * self.rows) for i in range(len(self.keys))]
         each = zip(blocks, self.seen, strict=True)
         return torch.stack([torch.cat([obs[name][block] for name in names], dim=1) for block, names in each])
 
 
 def joined(values: Shaped[Tensor, "step student row feature"]) -> Shaped[Tensor, "student rows feature"]:
-    """Return the rows of all steps side by side."""
+    """Return the rows of all steps, concatenated."""
     return values.transpose(0, 1).flatten(1, 2)
 
 
@@ -157,14 +157,14 @@ class Distiller(Learning):
         return [*super().episode_names, *(f"Score/{key.name}" for key in self.keys)]
 
     def set_rate(self, share: float) -> None:
-        """Learn at the rate that stands when a share of the run is over."""
+        """Set the learning rate for the finished share of the run."""
         first, last = self._spec.learning_rate, self._spec.final_learning_rate
         self._rate = first if last is None else first * (last / first) ** share
         for each in self.rollouts:
             each.stack.set_rate(self._rate)
 
     def __call__(self, obs: Mapping[str, Tensor]) -> Tensor:
-        """Return what the students ask for; keep that, what they saw, and what the teacher would do."""
+        """Return the students' actions; store actions, observations and the teacher's actions."""
         copy_each(list(self._seen.values()), [obs[name] for name in self._seen])
         self._chosen()
         t = self._step
@@ -201,10 +201,10 @@ class Distiller(Learning):
         return stack.student(place)
 
     def acting(self) -> Actor:
-        """Return who acts in all environments: each student in its block, from now on by the weights that it has now."""
+        """Return an actor for all environments: each student in its block."""
         return ActingStudents(self)
 
-    # What is captured
+    # Captured functions
 
     def _choose(self) -> None:
         with torch.no_grad():
@@ -225,9 +225,9 @@ class Distiller(Learning):
 
         def answer(rollout: Rollout) -> None:
             memory = rollout.begun
-            for x, before, ended in zip(rollout.x, rollout.before, self._ended, strict=True):
+            for x, previous, ended in zip(rollout.x, rollout.before, self._ended, strict=True):
                 output = rollout.stack(x, memory)
-                before.copy_(output.action)
+                previous.copy_(output.action)
                 memory = forgotten(output.memory, rollout.split(ended))
 
         with torch.no_grad():
@@ -238,14 +238,14 @@ class Distiller(Learning):
         self._beside([partial(self._pass, rollout, errors) for rollout, errors in zip(self.rollouts, each, strict=True)])
 
     def _pass(self, rollout: Rollout, errors: Float[Tensor, " student"]) -> None:
-        """Have a stack go through the rollout once; add the errors of its actions."""
+        """Make one pass of a stack through the rollout; add the errors of its actions."""
         memory = rollout.begun
         for first in range(0, self._spec.steps, self._spec.gradient_length):
             step_error, memory = self._descend(rollout, slice(first, first + self._spec.gradient_length), memory)
             errors += step_error
 
     def _descend(self, rollout: Rollout, steps: slice, memory: Tensor) -> tuple[Float[Tensor, " student"], Tensor]:
-        """Take one gradient step of a stack; return the errors of its actions, and what it remembers then."""
+        """Take one gradient step of a stack; return the errors of its actions, and its next memory."""
         spec = self._spec
         detached = total = torch.zeros(len(rollout.keys), device=memory.device)
         parts = [steps] if rollout.stack.memory == 0 else [slice(t, t + 1) for t in range(steps.start, steps.stop)]
@@ -358,7 +358,7 @@ class ActingStudents(Actor):
         self._memory = [torch.zeros_like(rollout.memory) for rollout in self._rollouts]
 
     def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
-        """Return the actions of each student for what its own environments let it see."""
+        """Return the actions of each student for its environments' observations."""
         actions = []
         with torch.no_grad():
             for i, rollout in enumerate(self._rollouts):

@@ -1,7 +1,7 @@
-"""What students have learned: a policy file each, and a table of their scores.
+"""Results of students: a policy file each, and a table of their scores.
 
-An interval over seeds and episodes is the wider one of two: Student's, of the means of the seeds, which spread by both but are
-few; and that of all episodes, as if seeds made no difference.
+An interval over seeds and episodes is the wider one of two: Student's, of the seeds' means, which vary by both but are few; and
+the interval of all episodes, as if seeds made no difference.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from tgdsl.rl.students.student import acting, deployed
 
 
 class Row(NamedTuple):
-    """Students that differ in their seeds alone: what they feel, their mean score with its 95 % interval, `low` to `high`.
+    """Students that differ in their seeds alone: their touch, their mean score with its 95 % interval, `low` to `high`.
 
-    `held` is the share of the episodes that lasted as long as one may, `samples` are the control steps of each student,
-    `minutes` how long they have learned, with all others of the simulation [min].
+    `held` is the share of episodes of full length, `samples` are the control steps of each student, `minutes` the training
+    time, together with all other students of the simulation [min].
     """
 
     type: str
@@ -59,9 +59,9 @@ def rows_of(
         kinds.setdefault(key.kind, []).append(evaluation)
     rows = []
     for (type_, placement, noise), each in kinds.items():
-        score, held = fmean(own.score for own in each), fmean(own.held for own in each)
+        score, held = fmean(one.score for one in each), fmean(one.held for one in each)
         low, high = interval(each)
-        episodes = sum(own.episodes for own in each)
+        episodes = sum(one.episodes for one in each)
         rows.append(Row(type_, placement, resolution, noise, len(each), score, low, high, held, episodes, samples, minutes))
     return rows
 
@@ -72,13 +72,13 @@ def interval(evaluations: Sequence[Evaluation]) -> tuple[float, float]:
     halves = [0.5 * (each.score_interval[1] - each.score_interval[0]) for each in evaluations]
     half = math.sqrt(sum(half_width**2 for half_width in halves)) / num
     if num > 1:
-        with np.errstate(invalid="ignore"):  # of a score that is not finite there is no interval
+        with np.errstate(invalid="ignore"):  # a score that is not finite has no interval
             half = max(half, float(student_t.ppf(0.975, num - 1) * np.std(scores, ddof=1)) / math.sqrt(num))
     return fmean(scores) - half, fmean(scores) + half
 
 
 def write_table(rows: Sequence[Row], file: Path) -> None:
-    """Write rows as CSV; raise `FileError` if that cannot be written."""
+    """Write rows as CSV; raise `FileError` if the file cannot be written."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(Row._fields)
@@ -89,7 +89,7 @@ def write_table(rows: Sequence[Row], file: Path) -> None:
 def shown(rows: Sequence[Row], unit: str, is_less_better: bool = False) -> str:
     """Return rows as a table for people, the best first."""
     cells = []
-    for row in sorted(rows, key=lambda own: own.score if is_less_better else -own.score):
+    for row in sorted(rows, key=lambda each: each.score if is_less_better else -each.score):
         place = " ".join(part for part in (row.placement, row.resolution, row.noise) if part)
         bounds = f"{row.low:.3f} to {row.high:.3f}" if math.isfinite(row.low) else "–"
         cells.append((row.type, place, f"{row.seeds}", f"{row.score:.3f}", bounds, f"{row.held:.1%}", f"{row.samples:,}"))

@@ -1,9 +1,9 @@
-"""How students are taught: the numbers of DAgger, of their networks and of what their latent is decoded to.
+"""Training of students: the parameters of DAgger, of their networks and decoders.
 
 Source of the defaults: Chung et al., *Tactile Genesis*, appendix, "Optimization and Network Hyperparameters" and the table of
-auxiliary losses; the tasks' own departures from them stand in their specs. What the paper leaves open, and is chosen here:
-`steps`, `std`, what `clip` bounds, that errors are means over steps, environments and joints, that decoders take the
-embeddings, and that images of all links share their weights.
+auxiliary losses; the tasks' specs have their departures. Not in the paper, and ours: `steps`, `std`, the quantity that `clip`
+bounds, errors as means over steps, environments and joints, decoders of the embeddings, and shared weights for the images of
+all links.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Loss = Literal["mse", "inverse_variance", "huber"]
 
 
 class DecoderSpec(SpecModel):
-    """A head that tells a privileged number from the embeddings: a loss that is dropped at deployment."""
+    """A head that predicts a privileged number from the embeddings: an auxiliary loss, without use at deployment."""
 
     weight: NonNegative = 1.0
     """Weight of its squared error."""
@@ -48,11 +48,11 @@ class StudentNetworksSpec(SpecModel):
     """Networks of a student: groups are normalised, each is embedded, and the embeddings are mapped together."""
 
     kind: Literal["mlp", "lstm"] = "mlp"
-    """Kind of the network that embeds each group but touch."""
+    """Kind of the network that embeds each group except touch."""
     encoder: EncoderSpec = EncoderSpec()
     """Its widths; an `lstm` has the last one."""
     touch_kind: Literal["mlp", "lstm", "cnn", "convrnn"] = "mlp"
-    """Kind of the network that embeds touch; of types that have no images, `mlp` in place of `cnn`, `lstm` of `convrnn`."""
+    """Kind of the network that embeds touch; for types without images `cnn` becomes `mlp`, and `convrnn` becomes `lstm`."""
     touch_encoder: TouchEncoderSpec = TouchEncoderSpec()
     """Its widths, in the same way."""
     convolution: ConvolutionSpec = ConvolutionSpec()
@@ -60,13 +60,13 @@ class StudentNetworksSpec(SpecModel):
     hidden: Widths = WIDTHS
     """Widths of the hidden layers that follow the embeddings."""
     eps: Positive = 1e-5
-    """What is added to the standard deviation by which an observation is divided, in the observation's unit."""
+    """Offset of the standard deviation that normalises an observation, in the observation's unit."""
     clip: Positive = 10.0
     """Bound of normalised observations."""
 
 
 class DistillSpec(SpecModel):
-    """How students are taught."""
+    """Training of students."""
 
     iterations: Whole = 6000
     """Iterations of the whole run: rollout and update."""
@@ -75,41 +75,40 @@ class DistillSpec(SpecModel):
     gradient_length: Whole = 2
     """Control steps of a gradient step, through which recurrent networks are differentiated."""
     epochs: Whole = 5
-    """How often an update goes through its rollout."""
+    """Passes of an update through its rollout."""
     aggregate: Whole = 1
-    """Rollouts that updates learn from, the latest and those before it: a first pass goes through the latest one, each other
-    one through one of them at random, as DAgger's set is of all that was seen; 1: the latest alone. A run that goes on begins
-    to gather them again."""
+    """Number of latest rollouts that updates learn from, as DAgger aggregates its data: the first pass uses the latest one,
+    each other pass a random one; 1: the latest alone. A resumed run gathers them from scratch."""
     learning_rate: Positive = 1e-4
-    """Learning rate, at the start where it falls."""
+    """Learning rate; with `final_learning_rate`, the initial one."""
     final_learning_rate: Positive | None = None
-    """Learning rate that it falls to, geometrically with the share that is over of all iterations, or of all minutes if of
-    these more is over, those before the run went on included; null: it stays."""
+    """Final learning rate of a geometric decay with the finished share of iterations or of minutes, whichever is larger,
+    including earlier starts of the run; null: constant."""
     max_grad_norm: Positive | None = 2.0
-    """Norm to which the gradient of each student is scaled down; null: it is not."""
+    """Largest norm of each student's gradient; null: no bound."""
     loss: Loss = "mse"
     """Mean of e², e = a_s − a_t; of e²/σ_t², σ_t the standard deviation with which the teacher explores; or of Huber's
     loss, e² up to |e| = 1 and 2|e| − 1 beyond."""
     normalise: StrictBool = False
     """Whether e is divided by the standard deviation of the teacher's actions over all states seen so far, joint by joint."""
     pushes: StrictBool = True
-    """Whether objects are pushed while students are taught, as `randomise.push` says."""
+    """Whether objects are pushed in the students' training, as `randomise.push` says."""
     clip: Positive | None = None
-    """Bound of a student's change of an action within an update, as PPO bounds values: of the losses of a_s and of
-    a_0 + clamp(a_s − a_0, ±clip) the larger one counts, a_0 being what it asked for in the rollout,
-    and in an earlier one what it would ask for when the pass begins; null: there is none."""
+    """Bound of a student's change of an action within an update, as PPO bounds values: the larger loss of a_s and
+    a_0 + clamp(a_s − a_0, ±clip) counts. a_0 is the student's action in the latest rollout; in earlier rollouts, its action
+    with the weights at the start of the pass; null: no bound."""
     std: NonNegative = 0.0
-    """Standard deviation of what is added to a student's actions in rollouts."""
+    """Standard deviation of the noise on a student's actions in rollouts."""
     groups: Groups | None = None
-    """Groups of observations that students see beside touch; default: `proprio`, and `goal` if there is one."""
+    """Groups of observations that students see in addition to touch; default: `proprio`, and `goal` if there is one."""
     networks: StudentNetworksSpec = StudentNetworksSpec()
     """Networks."""
     decoders: dict[str, DecoderSpec] = {}
-    """Heads by the privileged number that they tell: see the task."""
+    """Heads by the privileged number that they predict: see the task."""
     precision: Literal["float32", "tf32"] = "tf32"
-    """How a GPU multiplies matrices: `float32` or `tf32`."""
+    """Precision of a GPU's matrix products: `float32` or `tf32`."""
     checkpoint: Time = 10.0
-    """What a run that is killed loses at most, if its iterations are no longer [s]."""
+    """Longest time that a killed run loses, if its iterations are no longer [s]."""
 
     @model_validator(mode="after")
     def _check(self) -> DistillSpec:

@@ -1,15 +1,14 @@
 """A student: groups of observations are normalised, each is embedded, and the embeddings are mapped to actions together.
 
 A network that embeds a group takes (env, feature) and its memory, (env, memory), and returns the embedding and the next memory;
-an episode begins with zeros. Images are made from the features themselves, so that a policy takes the same numbers whatever its
-network. While a student is taught, heads tell privileged numbers from the embeddings.
+an episode begins with zeros. Images are built from the features, so a policy's inputs do not depend on its network. In
+training, heads predict privileged numbers from the embeddings.
 
 Students of one architecture are stacked: their weights are one tensor each, and they step together. A stack of N is N
 separate trainings: each student has its own weights, normalisation, gradient norm and moments of Adam.
 
-Shapes: `env` environments, `feature` numbers of all groups, side by side, `memory` numbers that are remembered of an episode,
-`size` of an embedding, `joint` joints that the policy moves, `target` privileged numbers, `student` students of a stack, `row`
-rows of each.
+Shapes: `env` environments, `feature` numbers of all groups, concatenated, `memory` numbers of an episode's memory, `size` of an
+embedding, `joint` joints that the policy moves, `target` privileged numbers, `student` students of a stack, `row` rows of each.
 """
 
 from __future__ import annotations
@@ -32,10 +31,10 @@ Kind = Literal["mlp", "lstm", "cnn", "convrnn"]
 
 @dataclass(frozen=True)
 class Grid:
-    """Where taxels stand in the images of their links; links whose grids are smaller than the largest fill a corner.
+    """Places of taxels in the images of their links; grids smaller than the largest one fill a corner.
 
-    Features are the `channels` numbers of a taxel, those of all taxels of the first channel, then of the second. The shape is
-    links, rows, columns; of each cell there is the taxel, −1 where there is none.
+    Features are the `channels` numbers of a taxel: the first channel of all taxels, then the second. The shape is links, rows,
+    columns; `taxels` has the taxel of each cell, −1 without one.
     """
 
     channels: int
@@ -46,10 +45,10 @@ class Grid:
 
 @dataclass(frozen=True)
 class Encoder:
-    """What network embeds a group.
+    """The network that embeds a group.
 
-    `hidden` are widths of an `mlp`'s hidden layers, the one of an `lstm`, channels of `cnn` and of `convrnn`; `size` is that of
-    the embedding, `kernel` the width of the kernels of images [taxel].
+    `hidden` has the widths of an `mlp`'s hidden layers, the width of an `lstm`, or the channels of `cnn` and `convrnn`; `size`
+    is the embedding's size, `kernel` the width of the kernels of images [taxel].
     """
 
     kind: Kind
@@ -74,7 +73,7 @@ def network(size: int, encoder: Encoder) -> Embedding:
 
 
 class Embedding(nn.Module):
-    """A network that embeds a group, and remembers so many numbers of an episode."""
+    """A network that embeds a group, with `memory` numbers of recurrent state."""
 
     memory: int = 0
 
@@ -109,7 +108,7 @@ class Lstm(Embedding):
 
 
 class Images(Embedding):
-    """What networks of images have in common: features as images of links, with a channel that tells where there are taxels."""
+    """Base of networks on images: features as images of links, with a channel that marks taxels."""
 
     cells: Tensor
     mask: Tensor
@@ -128,13 +127,13 @@ class Images(Embedding):
         return by_channel[:, :, self.cells.flatten()].unflatten(2, self.grid.shape).transpose(1, 2) * self.mask
 
     def marked(self, x: Tensor) -> Tensor:
-        """Return the images of all links and environments, and as their last channel the mask."""
+        """Return the images of all links and environments, with the mask as the last channel."""
         mask = self.mask.expand(x.shape[0], -1, -1, -1, -1)
         return torch.cat([self.images(x), mask], dim=2).flatten(0, 1)
 
 
 class Convolution(Images):
-    """Convolutions, the same ones of all links, then a projection of all that they find."""
+    """Convolutions, shared by all links, then a projection of all their features."""
 
     def __init__(self, size: int, encoder: Encoder):
         assert encoder.grid is not None
@@ -173,7 +172,7 @@ class RecurrentConvolution(Images):
 
 
 def gated(gates: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-    """Return h and c after a step; gates i, f, g, o stand side by side along dimension 1."""
+    """Return h and c after a step; gates i, f, g, o are concatenated along dimension 1."""
     i, f, g, o = gates.chunk(4, dim=1)
     c = f.sigmoid() * c + i.sigmoid() * g.tanh()
     return o.sigmoid() * c.tanh(), c
@@ -181,13 +180,13 @@ def gated(gates: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class Architecture:
-    """All that students of one stack have in common."""
+    """Networks that the students of one stack share."""
 
     groups: tuple[tuple[int, Encoder], ...]  # size of each group of observations, and the network that embeds it
     hidden: tuple[int, ...]  # widths of the hidden layers that follow the embeddings
     actions: int  # number of joints
     heads: tuple[tuple[int, ...], ...] = ()  # widths of the hidden layers of each decoder
-    eps: float = 1e-5  # what is added to the standard deviation by which an observation is divided
+    eps: float = 1e-5  # offset of the standard deviation that normalises an observation
     clip: float = 10.0  # bound of normalised observations
 
     @property
@@ -197,15 +196,15 @@ class Architecture:
 
 
 class StudentOutput(NamedTuple):
-    """What a student makes of observations."""
+    """Output of a student."""
 
     action: Tensor  # actions
-    decoded: Tensor  # what the decoders tell
-    memory: Tensor  # what it remembers
+    decoded: Tensor  # outputs of the decoders
+    memory: Tensor  # next memory
 
 
 class Student(nn.Module):
-    """A student; it remembers `memory` numbers of an episode."""
+    """A student, with `memory` numbers of recurrent state."""
 
     mean: Tensor
     var: Tensor
@@ -233,7 +232,7 @@ class Student(nn.Module):
 
 
 class Acting(nn.Module):
-    """The networks of a student as a function: of observations alone, (env, feature), if it remembers nothing."""
+    """The networks of a student as a function of observations, (env, feature), and of memory if it has any."""
 
     def __init__(self, student: Student):
         super().__init__()
@@ -242,12 +241,12 @@ class Acting(nn.Module):
         self.output_names = ("actions", "next_memory") if student.memory else ("actions",)
 
     def forward(self, x: Tensor, memory: Tensor | None = None) -> Tensor | tuple[Tensor, Tensor]:
-        """Return actions, and what is remembered."""
+        """Return actions, and the next memory if there is one."""
         output = self.student(x, x.new_zeros((x.shape[0], 0)) if memory is None else memory)
         return output.action if memory is None else (output.action, output.memory)
 
     def get_dummy_inputs(self) -> tuple[Tensor, ...]:
-        """Return an example of what it takes."""
+        """Return example inputs."""
         sizes = (self.student.architecture.num_features, self.student.memory)
         return tuple(torch.zeros((2, size)) for size in sizes[: len(self.input_names)])
 
@@ -264,11 +263,11 @@ def begin(self, ended: Tensor) -> None:
     if self.memory.shape[0] == ended.shape[0]:
         self.memory = self.memory.masked_fill(ended.to(self.memory.device).unsqueeze(1), 0.0)
 """
-"""TorchScript of a student that remembers its episodes; `begin` has it forget those that have ended, (env,)."""
+"""TorchScript of a recurrent student; `begin` resets the memory of ended episodes, (env,)."""
 
 
 class Deployed(nn.Module):
-    """A traced student, and what it remembers of each environment's episode."""
+    """A traced student, and its memory of each environment's episode."""
 
     def __init__(self, student: torch.jit.ScriptModule, size: int):
         super().__init__()
@@ -276,7 +275,7 @@ class Deployed(nn.Module):
 
 
 def acting(student: Student) -> Acting:
-    """Return a copy of a student on the CPU, without decoders; nor gradients, as memory would keep the graph of all steps."""
+    """Return a copy of a student on the CPU, without decoders and gradients: memory would retain the graph of all steps."""
     student_copy = copy.deepcopy(student).cpu().eval().requires_grad_(False)
     student_copy.decoders = nn.ModuleList()
     return Acting(student_copy)
@@ -294,18 +293,18 @@ def deployed(network: Acting) -> torch.jit.ScriptModule:
 
 
 def forgotten(memory: Tensor, ended: Tensor) -> Tensor:
-    """Return what is remembered, zeros where an episode has ended."""
+    """Return the memory, with zeros where an episode has ended."""
     return torch.where(ended[..., None], 0.0, memory)
 
 
-NORM_EPS = 1e-6  # what `torch.nn.utils.clip_grad_norm_` adds to a norm
+NORM_EPS = 1e-6  # offset of a norm in `torch.nn.utils.clip_grad_norm_`
 
 
 class Stack:
     """Students of one architecture.
 
-    `parameters` are their weights by name, (student, …); `buffers`, in the same way, means and variances by which they
-    normalise what they see: copies of `moments`, float64 views of `seen`, (student, feature).
+    `parameters` are their weights by name, (student, …); `buffers`, in the same way, means and variances that normalise their
+    observations: copies of `moments`, float64 views of `seen`, (student, feature).
     """
 
     def __init__(
@@ -331,11 +330,11 @@ class Stack:
         self._called: Any = vmap(self._call)
 
     def __call__(self, x: Float[Tensor, "student row feature"], memory: Float[Tensor, "student row memory"]) -> StudentOutput:
-        """Return what each student makes of its own rows: (student, row, …)."""
+        """Return each student's output for its rows: (student, row, …)."""
         return StudentOutput(*self._called(self.parameters, self.buffers, x, memory))
 
     def descend(self, losses: Float[Tensor, " student"]) -> None:
-        """Take one step of Adam, each student by its own loss."""
+        """Take one step of Adam, each student by its loss."""
         weights = list(self.parameters.values())
         gradients = torch.autograd.grad(losses.sum(), weights)
         with torch.no_grad():
@@ -348,7 +347,7 @@ class Stack:
         self.optimiser.step()
 
     def set_rate(self, learning_rate: float) -> None:
-        """Set Adam's learning rate, from the next step on, also of those that a CUDA graph holds."""
+        """Set Adam's learning rate from the next step on, also in a captured CUDA graph."""
         if isinstance(self._rate, Tensor):
             self._rate.fill_(learning_rate)
         else:
@@ -357,7 +356,7 @@ class Stack:
 
     @torch.no_grad()
     def observe(self, x: Float[Tensor, "student row feature"]) -> None:
-        """Take rows into account in each student's mean and variance, in place."""
+        """Update each student's mean and variance by rows, in place."""
         var, mean = torch.var_mean(x.double(), dim=1, correction=0)
         self.seen.merge(x.shape[1], mean, var)
         self._normalise()
@@ -370,13 +369,13 @@ class Stack:
         return student
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that teaching goes on from: live tensors."""
+        """Return the state for resuming: live tensors."""
         networks = {name: value.detach() for name, value in self.parameters.items()}
         seen = self.moments | {"rows": self.seen.count}
         return {"networks": networks, "seen": seen, "optimiser": self.optimiser.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what was saved, with the learning rate that the stack has."""
+        """Resume from a saved state, with the stack's present learning rate."""
         current = self.state_dict()
         for part in ("networks", "seen"):
             if current[part].keys() != state[part].keys():
@@ -411,7 +410,7 @@ class Stack:
 
 
 def seeded_student(architecture: Architecture, seed: int) -> Student:
-    """Return a student whose first weights follow from a seed alone."""
+    """Return a student with initial weights from a seed alone."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return Student(architecture)
