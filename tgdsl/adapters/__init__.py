@@ -1,4 +1,4 @@
-"""Touch in other people's simulators: a file each, which imports the simulator that it is for."""
+"""Touch in other simulators: a file for each, which imports its simulator."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ Document = str | PathLike[str] | Mapping[str, Any]
 
 
 def module_of(document: Document, host: str, scene: Any = None) -> TactileModule:
-    """Compile a document, of a scene that is built already if one is given, or load an artefact (`.safetensors`)."""
+    """Compile a document, for an existing scene if one is given, or load an artefact (`.safetensors`)."""
     is_artifact = not isinstance(document, Mapping) and str(document).endswith(".safetensors")
     if is_artifact and scene is not None:
         raise SimulationError(f"{document}: an artefact is compiled for its scene already; expected a document with `scene_fn`")
     touch = load(document) if is_artifact else compile(document, scene=scene)  # pyright: ignore[reportArgumentType]
     if touch.inputs.substeps > 1:
-        what = f"this module is advanced at {touch.inputs.substeps} physics steps a call"
-        raise SimulationError(f"{what}, and {host} reads it once a control step")
+        problem = f"this module is advanced at {touch.inputs.substeps} physics steps a call"
+        raise SimulationError(f"{problem}, and {host} reads it once a control step")
     return touch

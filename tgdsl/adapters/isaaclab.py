@@ -1,6 +1,6 @@
 """Touch as a sensor of Isaac Lab on its Newton backend, as a `TactileSensorCfg` in a scene's configuration.
 
-The contract is that of `SensorBase` in Isaac Lab 3: masks of environments, and data that are evaluated when asked for.
+It follows the contract of `SensorBase` in Isaac Lab 3: masks of environments, and data evaluated on access.
 """
 
 # pyright: reportMissingImports=false, reportGeneralTypeIssues=false
@@ -21,7 +21,7 @@ from tgdsl.adapters.newton import SensorTactile
 
 
 class TactileSensor(SensorBase):
-    """The readings of all environments by name, `data`, of the instant that Newton's state then has.
+    """The readings of all environments by name, `data`, at the instant of Newton's state.
 
     Sensors advance when they are first asked for after a step; with an `update_period`, when that has passed. An environment
     that is reset is read again, alone, and has no contacts until the next step.

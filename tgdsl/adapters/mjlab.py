@@ -52,7 +52,7 @@ class TouchSensor(Sensor):
     def __init__(self, cfg: TouchSensorCfg, touch: TactileModule):
         super().__init__()
         self.touch, self._cfg, self._elapsed = touch, cfg, 0.0
-        self._due: Bool[Tensor, " env"] | None = None  # what is to be read; None: all
+        self._due: Bool[Tensor, " env"] | None = None  # environments to read; None: all
 
     def edit_spec(self, scene_spec: mujoco.MjSpec, entities: Mapping[str, Any]) -> None:
         """Leave the scene as it is: contacts are read without sensors."""

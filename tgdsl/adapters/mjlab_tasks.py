@@ -3,8 +3,8 @@
     python -m mjlab.scripts.train Tgdsl-In-Palm-Rotate --env.scene.num-envs 4096
 
 As in `tgdsl.rl.tasks.in_palm_rotate`, a goal is a quarter turn further about the vertical. Terms: `spin`, `success`, `tilt`,
-`object_distance`, `drop`, `action_rate`; weights are those of examples/tasks/in_palm_rotate.yaml. There is one object, a cube;
-drives are ideal, and nothing is random but where the cube is put.
+`object_distance`, `drop`, `action_rate`, with the weights of examples/tasks/in_palm_rotate.yaml. There is one object, a cube;
+drives are ideal, and only the cube's place is random.
 
 Shapes: `env` environments, `feature` numbers of an observation.
 """

@@ -64,12 +64,12 @@ class SensorTactile:
         child, parent = (getattr(model, f"joint_{end}").numpy()[joints[0]] for end in ("child", "parent"))
         parents = tuple((labels[below], labels[above]) for below, above in zip(child, parent, strict=True))
         self._geoms = Geoms(tuple(labels[i] for i in model.shape_body.numpy()[shapes[0]]), tuple(shape_labels), parents)
-        chosen = joints[:, [index_of(name, joint_labels, "joint", "joints") for name in self._inputs.joints]]
+        joint_ids = joints[:, [index_of(name, joint_labels, "joint", "joints") for name in self._inputs.joints]]
         first = {name: getattr(model, f"joint_{name}_start").numpy() for name in ("q", "qd")}
-        if (first["q"][chosen + 1] - first["q"][chosen] != 1).any():
+        if (first["q"][joint_ids + 1] - first["q"][joint_ids] != 1).any():
             raise SimulationError(f"of the joints {listed(self._inputs.joints)}, some are no hinges or slides")
         ends = {"joint_pos": "q", "joint_vel": "qd"}.items()
-        self._joints = {name: (end, self._tensor(first[end][chosen])) for name, end in ends if name in self._inputs.fields}
+        self._joints = {name: (end, self._tensor(first[end][joint_ids])) for name, end in ends if name in self._inputs.fields}
         pair_rows(self._inputs, self._geoms)
         self._kinematics(model)
 
@@ -135,12 +135,12 @@ class SensorTactile:
 
 
 def _by_world(model: Any, kind: str) -> tuple[Int[np.ndarray, "world item"], list[str]]:
-    """Return the indices of each world's bodies, shapes or joints, then of those of none, and the first world's labels."""
+    """Return the indices of each world's bodies, shapes or joints, followed by shared ones, and the first world's labels."""
     world, labels = getattr(model, f"{kind}_world").numpy(), getattr(model, f"{kind}_label")
-    shared, own = np.flatnonzero(world < 0), [np.flatnonzero(world == i) for i in range(max(model.world_count, 1))]
-    ends = [[labels[i].rpartition("/")[2] for i in ids] for ids in own]
+    shared, ids_of_world = np.flatnonzero(world < 0), [np.flatnonzero(world == i) for i in range(max(model.world_count, 1))]
+    ends = [[labels[i].rpartition("/")[2] for i in ids] for ids in ids_of_world]
     if different := [i for i, names in enumerate(ends) if names != ends[0]]:
-        what = listed(sorted({*ends[0]} ^ {*ends[different[0]]})) or "their order"
-        raise SimulationError(f"worlds 0 and {different[0]} differ in their {kind} labels: {what}")
-    ids = np.stack([np.concatenate([items, shared]) for items in own])
+        difference = listed(sorted({*ends[0]} ^ {*ends[different[0]]})) or "their order"
+        raise SimulationError(f"worlds 0 and {different[0]} differ in their {kind} labels: {difference}")
+    ids = np.stack([np.concatenate([items, shared]) for items in ids_of_world])
     return ids, [labels[i] for i in ids[0]]

@@ -1,10 +1,10 @@
-"""What can be said of a fit: errors on data that were held out, intervals, and what the data cannot tell.
+"""Quality of a fit: errors on held-out data, confidence intervals, and identifiability.
 
-An interval by profile holds the values of a parameter whose best fit, all else free, is worse by less than Student's t allows
-(Bates and Watts, *Nonlinear Regression Analysis*, 1988, section 6.1): for independent normal noise. By bootstrap it is that of
-fits to rows, or samples, drawn with replacement: also where residuals are those of the model rather than noise.
+A profile interval contains the values of a parameter whose best fit, all else free, is worse by less than Student's t allows
+(Bates and Watts, *Nonlinear Regression Analysis*, 1988, section 6.1); it assumes independent normal noise. A bootstrap interval
+comes from fits to rows, or samples, drawn with replacement; it also holds where residuals are model errors rather than noise.
 
-Shapes: `unknown` entries of a problem's x, `fold` parts that are held out in turn.
+Shapes: `unknown` entries of a problem's x, `fold` parts held out in turn.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ HoldOut = Literal["none", "taxel", "blocks", "time", "recording"]
 Intervals = Literal["profile", "bootstrap", "none"]
 LEVEL = 0.95
 CORRELATED = 0.95
-UNKNOWN = 0.9  # part of its range from which a parameter's interval says nothing
-WORSE = 1.2  # held-out error over the error in-sample from which a fit is warned of
+UNKNOWN = 0.9  # width of an interval, as a share of the parameter's range, from which the parameter is not identified
+WORSE = 1.2  # ratio of held-out to in-sample error from which a fit gets a warning
 RESAMPLES = 100
 
 
 @dataclass(frozen=True)
 class TargetErrors:
-    """Relative RMSE of a target: the RMS of the residuals over that of the target."""
+    """Relative RMSE of a target: the residuals' RMS over the target's."""
 
     recording: str  # name of the recording
     reading: str  # the reading
     error: float  # in-sample
-    held_out: float | None  # on numbers that were held out; None: none were
+    held_out: float | None  # on held-out numbers; None without any
     floor: float | None  # of the target's noise; None: unknown
-    alone: float  # of the reading's own map without any sensor
+    alone: float  # of the reading's map without any sensor
     rms: float  # RMS of the target, in its unit
     unit: str  # unit of the reading
 
@@ -51,7 +51,7 @@ class TargetErrors:
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """How well the unknowns are known, from the derivatives at the optimum."""
+    """Uncertainty of the unknowns, from the derivatives at the optimum."""
 
     sigma: Float[np.ndarray, " unknown"]  # standard deviation of each unknown in x; infinite where nothing depends on it
     correlation: Float[np.ndarray, "unknown unknown"]  # correlations of the unknowns
@@ -60,21 +60,21 @@ class Uncertainty:
 
 
 def uncertainty(problem: Problem, solution: Solution) -> Uncertainty:
-    """Return how well the unknowns are known."""
+    """Return the uncertainty of the unknowns."""
     num = len(solution.x)
     jacobian = problem.jacobian(solution.x, problem.weights(), range(num), are_fixed=True)
     spent = problem.num_parameters + sum(len(best) for best in solution.coefficients)
     degrees = max(problem.num_numbers - spent, 1)
     noise = float(np.sqrt(solution.cost / degrees))
     size = np.linalg.norm(jacobian, axis=0)
-    told = np.flatnonzero(size > 1e-6 * noise)
+    ids = np.flatnonzero(size > 1e-6 * noise)
     covariance, sigma, correlation = np.zeros((num, num)), np.full(num, np.inf), np.eye(num)
-    if told.size:
-        scaled = jacobian[:, told] / size[told]
+    if ids.size:
+        scaled = jacobian[:, ids] / size[ids]
         inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-12, hermitian=True)
-        covariance[np.ix_(told, told)] = noise**2 * inverse / np.outer(size[told], size[told])
-        sigma[told] = np.sqrt(np.diag(covariance)[told])
-        correlation[np.ix_(told, told)] = covariance[np.ix_(told, told)] / np.outer(sigma[told], sigma[told])
+        covariance[np.ix_(ids, ids)] = noise**2 * inverse / np.outer(size[ids], size[ids])
+        sigma[ids] = np.sqrt(np.diag(covariance)[ids])
+        correlation[np.ix_(ids, ids)] = covariance[np.ix_(ids, ids)] / np.outer(sigma[ids], sigma[ids])
     return Uncertainty(sigma, correlation, noise, degrees)
 
 
@@ -124,16 +124,16 @@ def bootstrap_intervals(problem: Problem, solution: Solution, seed: int, progres
 
 
 def held_out(problem: Problem, solution: Solution, by: HoldOut, folds: int, seed: int, progress: Progress) -> list[float]:
-    """Return the relative RMSE of each part on numbers that were held out, each once."""
+    """Return the relative RMSE of each part on held-out numbers, each held out once."""
     predicted = [np.zeros_like(part.value) for part in problem.parts]
     for i, masks in enumerate(_masks(problem, by, folds, seed)):
         progress(f"fitting without held-out part {i + 1}")
         weights = [np.where(mask, 0.0, part.weight) for mask, part in zip(masks, problem.parts, strict=True)]
         fitted = problem.minimise(solution.x, weights, max_steps=20)
-        if by == "recording":  # nuisances are its own, parameters the others'
+        if by == "recording":  # fit its nuisances, with the parameters of the others
             fitted = problem.minimise(fitted.x, fixed=range(problem.num_parameters), are_fixed=True, max_steps=20)
-        for value, own, mask in zip(predicted, fitted.predicted, masks, strict=True):
-            value[mask] = own[mask]
+        for value, fold_prediction, mask in zip(predicted, fitted.predicted, masks, strict=True):
+            value[mask] = fold_prediction[mask]
     return problem.errors(predicted)
 
 
@@ -155,7 +155,7 @@ def _masks(problem: Problem, by: HoldOut, folds: int, seed: int) -> Iterator[lis
         of_row = rng.permutation(np.arange(rows) % folds) if by == "taxel" or places is None else _blocks(places, folds)
         fold_of.append(np.broadcast_to(of_row[None, :, None], part.target.value.shape).reshape(-1))
     for fold in range(folds):
-        yield [own == fold for own in fold_of]
+        yield [folds_of_part == fold for folds_of_part in fold_of]
 
 
 def _blocks(places: np.ndarray, folds: int) -> np.ndarray:
@@ -165,8 +165,8 @@ def _blocks(places: np.ndarray, folds: int) -> np.ndarray:
     strip = np.argsort(np.argsort(places @ along[0], kind="stable")) * columns // num
     result = np.zeros(num, dtype=np.int64)
     for i in range(columns):
-        own = np.flatnonzero(strip == i)
-        rank = np.argsort(np.argsort(places[own] @ along[min(1, len(along) - 1)], kind="stable"))
+        ids = np.flatnonzero(strip == i)
+        rank = np.argsort(np.argsort(places[ids] @ along[min(1, len(along) - 1)], kind="stable"))
         first, last = i * folds // columns, (i + 1) * folds // columns
-        result[own] = first + rank * (last - first) // len(own)
+        result[ids] = first + rank * (last - first) // len(ids)
     return result

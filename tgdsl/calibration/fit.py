@@ -58,13 +58,13 @@ class FittedParameter:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Parameters that fit recordings, and how well. `print(fit)` shows all of it."""
+    """Fitted parameters, and the quality of the fit. `print(fit)` shows all of it."""
 
-    parameters: Mapping[str, FittedParameter]  # what was fitted, by path
-    # offsets of poses [m] and clocks [s], gains and coefficients of the reading's own maps, by name
+    parameters: Mapping[str, FittedParameter]  # fitted parameters, by path
+    # offsets of poses [m] and clocks [s], gains and coefficients of the readings' maps, by name
     nuisances: Mapping[str, float]
     errors: tuple[TargetErrors, ...]  # errors, one for each target
-    warnings: tuple[str, ...]  # what the data cannot tell, and what speaks against the model
+    warnings: tuple[str, ...]  # parameters that the data do not identify, and signs of a wrong model
     problem: Problem  # the problem that was solved
     solution: Solution  # its solution
 
@@ -89,10 +89,10 @@ class Fit:
         return picture(self.problem, self.solution, self.errors, Path(path))
 
     def document(self, path: str | Path) -> Path:
-        """Write the document with the fitted values, its comments kept; return its path.
+        """Write the document with the fitted values and its comments; return its path.
 
         Raises:
-            TgdslError: If the document is a mapping, or the file would be in another folder, where its paths lead nowhere.
+            TgdslError: If the document is a mapping, or the file would be in another folder, where its paths are wrong.
         """
         source = self.problem.model.document
         if isinstance(source, Mapping):
@@ -103,7 +103,7 @@ class Fit:
         }
         out = Path(path)
         if out.resolve().parent != Path(source).resolve().parent:
-            raise TgdslError(f"{out}: file names in {source} are relative to its folder; write the fitted document beside it")
+            raise TgdslError(f"{out}: file names in {source} are relative to its folder; write the fitted document there")
         atomic_write(out, with_values(Path(source), values).encode())
         return out
 
@@ -190,18 +190,18 @@ def _best(problem: Problem, starts: int, seed: int, robust: bool, progress: Prog
     weights = problem.weights()
     progress(f"comparing {len(places)} starting points")
     ranked = sorted(places, key=lambda x: problem.solve(x, weights).cost)
-    chosen = [places[0], *[x for x in ranked if x is not places[0]][: CONTINUED - 1]]
+    places_to_try = [places[0], *[x for x in ranked if x is not places[0]][: CONTINUED - 1]]
     rough = []
-    for i, x in enumerate(chosen):
-        progress(f"fitting from starting point {i + 1} of {len(chosen)}")
+    for i, x in enumerate(places_to_try):
+        progress(f"fitting from starting point {i + 1} of {len(places_to_try)}")
         rough.append(problem.minimise(x, max_steps=12))
     progress("fitting from the best of them")
     solution = problem.minimise(min(rough, key=lambda each: each.cost).x)
     for i in range(ROUNDS):
         progress(f"estimating the noise, round {i + 1} of at most {ROUNDS}")
-        before = problem.sigma.copy()
+        previous = problem.sigma.copy()
         problem.estimate(solution, HUBER if robust else None)
-        if not robust and abs(problem.sigma / before - 1).max() < 0.02:
+        if not robust and abs(problem.sigma / previous - 1).max() < 0.02:
             break
         if not robust and len(problem.parts) == 1 and not problem.nuisances:
             solution = problem.solve(solution.x, problem.weights())
@@ -275,7 +275,7 @@ def _warnings(
                 notes.append(f"{names[i]} and {names[j]}: correlation {rho:.3f}, the data tell a combination of both")
     for nuisance, u in zip(problem.nuisances, solution.x[problem.num_parameters :], strict=True):
         if abs(u) > 3:
-            notes.append(f"{nuisance.label}: {u:.1f} standard deviations from what was recorded")
+            notes.append(f"{nuisance.label}: {u:.1f} standard deviations from the recorded value")
     for i, (e, part) in enumerate(zip(errors, problem.parts, strict=True)):
         name = f"{e.recording}: {e.reading}"
         if problem.gain and solution.coefficients[i][-1] < 0:
@@ -292,7 +292,7 @@ def _warnings(
 
 
 class CandidateSpec(SpecModel):
-    """A model to compare: changes of the document, and what is fitted."""
+    """A model to compare: changes of the document, and fitted parameters."""
 
     set: dict[str, Any] = {}
     """Values by dotted path, as `--set` takes them."""

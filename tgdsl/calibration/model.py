@@ -1,6 +1,6 @@
-"""A document as a function of some of its parameters: what its sensors would have read during a recording.
+"""A document as a function of some of its parameters: its sensors' readings during a recording.
 
-A parameter that only changes constants of its sensor is lowered again for that sensor alone; where one changes what the sensor
+A parameter that only changes constants of its sensor is lowered again for that sensor alone. If it changes the sensor's
 requests of the scene, or the shape of its constants, the document is compiled again.
 """
 
@@ -30,12 +30,12 @@ from tgdsl.quantities.base import Request
 from tgdsl.sensors import Kind
 from tgdsl.sensors.known import known_kinds
 
-DECADES = 1.0  # how far a positive parameter without bounds is searched from where it starts, either way
+DECADES = 1.0  # search range of a positive parameter without bounds around its start, either way
 LOGARITHMIC = 20.0  # ratio of bounds from which a positive parameter is searched by its logarithm
 
 
 class InfeasibleError(TgdslError):
-    """Values that are each within their bounds, and that no sensor can have together."""
+    """Values within their bounds that no sensor can have together."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Model:
         self._values = tuple(parameter.start for parameter in self.parameters)
 
     def set(self, values: Sequence[float]) -> None:
-        """Give the parameters other values; those of the last steps of a search are not lowered again.
+        """Set the parameters' values; constants of a search's last steps are cached.
 
         Raises `InfeasibleError` if the sensor cannot have them.
         """
@@ -106,9 +106,9 @@ class Model:
         self._values = values
 
     def predicted(self, recording: Recording, target: Target, fields: Mapping[str, np.ndarray], clock: float) -> np.ndarray:
-        """Return what the sensor would have read (sample, row, channel) for a target.
+        """Return the sensor's readings (sample, row, channel) for a target.
 
-        `fields` are the recording's states, shifted as its nuisances say; `clock` [s] is added to the target's times.
+        `fields` are the recording's states, shifted by its nuisances; `clock` [s] is added to the target's times.
         """
         time = target.time if target.zero is None else np.union1d(target.time, [target.zero])
         missing = [name for name in DERIVED if name in self.module.inputs.fields and name not in fields]
@@ -122,11 +122,11 @@ class Model:
         return values.sum(axis=1, keepdims=True) if target.is_sum else values
 
     def _read(self, reading: str, states: Mapping[str, np.ndarray], time: np.ndarray) -> np.ndarray:
-        wanted = self.module.inputs.fields
-        used = {name: value for name, value in states.items() if name in wanted}
+        needed = self.module.inputs.fields
+        used = {name: value for name, value in states.items() if name in needed}
         tensors: dict[str, Any] = {n: torch.from_numpy(v.astype(np.int64) if n in CHOICES else v) for n, v in used.items()}
         self.module.free()
-        if not self.module.has_state and "dt" not in wanted:
+        if not self.module.has_state and "dt" not in needed:
             return _rows(self.module(SceneState(**tensors))[reading])
         steps = np.diff(time, prepend=2 * time[0] - time[1] if len(time) > 1 else time[0] - 1.0)
         each = []
@@ -139,7 +139,7 @@ class Model:
         self._constants: dict[tuple[float, ...], dict[str, np.ndarray]] = {}
         with warnings.catch_warnings():
             if changes:
-                warnings.simplefilter("ignore")  # those of values on the way
+                warnings.simplefilter("ignore")  # of intermediate values
             result = compile_document(self.document, {**self._overrides, **changes}, self._own_kinds)
         self._loaded, self._resolved, self.plan = result
         self.module = TactileModule(self.plan, self._kinds, torch.float64)
@@ -148,11 +148,11 @@ class Model:
         self._compiled = {name: ways(self._loaded, self._resolved, name, kind, silent) for name, kind in self._kind_of.items()}
 
     def _lowered(self, values: Sequence[float]) -> dict[str, np.ndarray] | None:
-        """Return the constants that other values give, by the names of the plan; None: the document must be compiled again."""
+        """Return the constants for other values, by the names of the plan; None: the document must be compiled again."""
         result = {}
         for name in dict.fromkeys(parameter.path.split(".")[0] for parameter in self.parameters):
-            own = {p.path: v for p, v in zip(self.parameters, values, strict=True) if p.path.split(".")[0] == name}
-            spec = self._spec(name, own)
+            changes = {p.path: v for p, v in zip(self.parameters, values, strict=True) if p.path.split(".")[0] == name}
+            spec = self._spec(name, changes)
             loaded = dataclasses.replace(
                 self._loaded, spec=self._loaded.spec.model_copy(update={"sensors": {**self._loaded.spec.sensors, name: spec}})
             )
@@ -188,8 +188,8 @@ class Model:
             if value is None:
                 raise TgdslError(f"{'.'.join([sensor, *fields[:i]])}: the document gives no value, expected one to start from")
             if not isinstance(value, BaseModel) or name not in type(value).model_fields:
-                known = list(type(value).model_fields) if isinstance(value, BaseModel) else []
-                raise TgdslError(f'{path}: there is no field "{name}"; {did_you_mean(name, known, "fields")}')
+                names_of_fields = list(type(value).model_fields) if isinstance(value, BaseModel) else []
+                raise TgdslError(f'{path}: there is no field "{name}"; {did_you_mean(name, names_of_fields, "fields")}')
             info = type(value).model_fields[name]
             annotation, metadata, value = info.annotation, info.metadata, getattr(value, name)
         quantity = _mark(annotation, metadata)
@@ -208,7 +208,7 @@ def _rows(reading: torch.Tensor) -> np.ndarray:
 
 
 def _bounded(path: str, start: float, quantity: Quantity, usual: Usual | None, span: str, unit: str) -> Parameter:
-    """Return a parameter with the bounds of its field, within those that a user gives."""
+    """Return a parameter with the user's bounds, or with bounds from its field."""
     least = next((bound for bound in (quantity.ge, quantity.gt) if bound is not None), -math.inf)
     most = math.inf if quantity.le is None else quantity.le
     if span:
@@ -257,7 +257,7 @@ def _are_alike(one: Sequence[LoweredSensor], two: Sequence[LoweredSensor], kind:
 
 def _shape(sensor: LoweredSensor) -> object:
     lowered = sensor.lowered
-    requests = [Request.key(request) for request in lowered.requests]  # all of it, also what may differ in a shared use
+    requests = [Request.key(request) for request in lowered.requests]  # all fields, also non-shared ones
     noise = None if sensor.noise is None else (sensor.noise.terms, sensor.noise.streams, sensor.noise.memory)
     constants = {name: value.shape for name, value in _constants(sensor).items()}
     return requests, lowered.state, lowered.timestep, noise, constants

@@ -1,4 +1,4 @@
-"""Pictures of a fit: what was measured, what the sensor reads, and the difference.
+"""Pictures of a fit: measurements, the sensor's readings, and their difference.
 
 A target of one sample whose rows have places is a field of arrows over the link; one over time is lines of its largest rows.
 """
@@ -36,23 +36,23 @@ def picture(problem: Problem, solution: Solution, errors: Sequence[TargetErrors]
 
 
 def _field(panels: Sequence[Axes], part: Part, fitted: np.ndarray, places: np.ndarray | None, unit: str) -> None:
-    """Draw arrows at the rows' places, in the plane in which these spread; those of residuals are magnified."""
+    """Draw arrows at the rows' places, in the plane of their largest spread; residuals are magnified."""
     assert places is not None
     centred = places - places.mean(axis=0)
     axes = np.sort(np.argsort(np.ptp(centred, axis=0))[-2:])
     weight = part.weight.reshape(part.target.value.shape)[0].max(axis=1)
-    measured, shown = part.target.value[0], weight > 0
+    measured, is_used = part.target.value[0], weight > 0
     num = min(2, measured.shape[1])
     vectors = [np.pad(value[:, :num], ((0, 0), (0, 2 - num))) for value in (measured, fitted[0], fitted[0] - measured)]
     spread = np.ptp(centred[:, axes], axis=0).max() or 1.0
-    scale = np.linalg.norm(vectors[0][shown], axis=1).max() / (0.12 * spread) or 1.0
-    typical = 3 * np.linalg.norm(vectors[2][shown], axis=1).mean()
+    scale = np.linalg.norm(vectors[0][is_used], axis=1).max() / (0.12 * spread) or 1.0
+    typical = 3 * np.linalg.norm(vectors[2][is_used], axis=1).mean()
     larger = max(1.0, 10 ** np.floor(np.log10(scale * 0.12 * spread / typical))) if typical > 0 else 1.0
-    at = 1e3 * places[:, axes][shown].T
+    at = 1e3 * places[:, axes][is_used].T
     style = {"angles": "xy", "scale_units": "xy", "width": 0.004}
-    panels[0].quiver(*at, *vectors[0][shown].T, color=MEASURED, scale=scale / 1e3, label="measured", **style)
-    panels[0].quiver(*at, *vectors[1][shown].T, color=FITTED, scale=scale / 1e3, label="fit", **style)
-    panels[1].quiver(*at, *vectors[2][shown].T, color=RESIDUAL, scale=scale / 1e3 / larger, label=f"× {larger:g}", **style)
+    panels[0].quiver(*at, *vectors[0][is_used].T, color=MEASURED, scale=scale / 1e3, label="measured", **style)
+    panels[0].quiver(*at, *vectors[1][is_used].T, color=FITTED, scale=scale / 1e3, label="fit", **style)
+    panels[1].quiver(*at, *vectors[2][is_used].T, color=RESIDUAL, scale=scale / 1e3 / larger, label=f"× {larger:g}", **style)
     for panel in panels:
         panel.set_aspect("equal")
         panel.set_xlabel(f"{'xyz'[axes[0]]} [mm]", fontsize=9, color=INK)
@@ -67,10 +67,10 @@ def _lines(panels: Sequence[Axes], part: Part, fitted: np.ndarray, places: np.nd
     used = part.weight.reshape(samples, -1) > 0
     size = np.where(used, measured, 0.0).std(axis=0) if samples > 1 else abs(measured[0])
     for j in np.argsort(size)[::-1][:MOST_LINES]:
-        own = used[:, j]
-        panels[0].plot(part.target.time[own], measured[own, j], color=MEASURED, linewidth=0.8)
-        panels[0].plot(part.target.time[own], fit[own, j], color=FITTED, linewidth=0.8)
-        panels[1].plot(part.target.time[own], (fit - measured)[own, j], color=RESIDUAL, linewidth=0.8)
+        is_used = used[:, j]
+        panels[0].plot(part.target.time[is_used], measured[is_used, j], color=MEASURED, linewidth=0.8)
+        panels[0].plot(part.target.time[is_used], fit[is_used, j], color=FITTED, linewidth=0.8)
+        panels[1].plot(part.target.time[is_used], (fit - measured)[is_used, j], color=RESIDUAL, linewidth=0.8)
     panels[0].legend(("measured", "fit"), fontsize=8, frameon=False)
     panels[1].axhline(0, color=FAINT, linewidth=0.8, zorder=0)
     for panel in panels:

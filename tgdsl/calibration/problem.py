@@ -1,9 +1,9 @@
 """Least squares between a model's readings and recordings: parameters, nuisances, weights.
 
 The unknowns x are the parameters, each from 0 to 1 in its range, then the nuisances of the recordings in units of their
-standard deviations: offsets of state fields and of clocks, each with a normal prior. What is linear is solved for at each x:
-the reading's own offset or affine map, its gain, and the parameters in which all readings are linear (variable projection:
-Golub and Pereyra, *SIAM Journal on Numerical Analysis* 10, 1973, 413).
+standard deviations: offsets of state fields and of clocks, each with a normal prior. Linear unknowns are solved for at each x:
+the reading's offset or affine map, its gain, and the parameters in which all readings are linear (variable projection: Golub
+and Pereyra, *SIAM Journal on Numerical Analysis* 10, 1973, 413).
 
 Shapes: `unknown` entries of x, `number` numbers of a target, flat.
 """
@@ -30,7 +30,7 @@ Weights = Sequence[Float[np.ndarray, " number"]]
 
 
 class Nuisance(NamedTuple):
-    """An unknown offset of a recording: of one number of a state field (at one step or at all), or of a target's clock."""
+    """An unknown offset of a recording: of one number of a state field (at one step or all), or of a target's clock."""
 
     label: str
     recording: int
@@ -46,18 +46,18 @@ class Part(NamedTuple):
     target: Target
     value: Float[np.ndarray, " number"]
     weight: Float[np.ndarray, " number"]
-    columns: Float[np.ndarray, "number coefficient"]  # what the reading's own map adds per unit of its coefficients
+    columns: Float[np.ndarray, "number coefficient"]  # effect of the reading's map per unit of its coefficients
     names: tuple[str, ...]  # of the coefficients
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What some x gives."""
+    """The model's result at some x."""
 
     x: Float[np.ndarray, " unknown"]  # the unknowns, with the linear parameters as solved for
     residual: Float[np.ndarray, " residual"]  # weighted residuals, then the nuisances
     predicted: tuple[Float[np.ndarray, " number"], ...]  # readings of each part, by all of the model
-    # coefficients of each part's own map, the gain last if there is one
+    # coefficients of each part's map, the gain last if there is one
     coefficients: tuple[Float[np.ndarray, " coefficient"], ...]
 
     @property
@@ -78,7 +78,7 @@ class Problem:
     ):
         """Collect the unknowns.
 
-        Each recording's reading may have a map of its own, of all readings or by their names, and a gain of its own.
+        `reading` is the kind of each recording's map, for all readings or by name; `gain`: whether each also has a gain.
         """
         self.model, self.recordings, self.gain = model, tuple(recordings), gain
         self.places = {t.reading: None if t.is_sum else _places(model, t.reading) for r in recordings for t in r.targets}
@@ -99,10 +99,10 @@ class Problem:
         # the unknowns as the document and the recordings have them
         self.start = np.append([p.place(p.start) for p in model.parameters], np.zeros(len(self.nuisances)))
         self.num_numbers = sum(int((part.weight > 0).sum()) for part in self.parts)
-        wanted = len(self.names) + sum(part.columns.shape[1] + gain for part in self.parts)
-        if self.num_numbers <= wanted:
+        unknowns = len(self.names) + sum(part.columns.shape[1] + gain for part in self.parts)
+        if self.num_numbers <= unknowns:
             names = ", ".join(recording.name for recording in recordings)
-            problem = f"{self.num_numbers} numbers in all, expected more than the {wanted} unknowns: {', '.join(self.names)}"
+            problem = f"{self.num_numbers} numbers in all, expected more than the {unknowns} unknowns: {', '.join(self.names)}"
             raise TgdslError(f"{names}: {problem}")
 
     def values(self, x: np.ndarray) -> tuple[float, ...]:
@@ -110,11 +110,11 @@ class Problem:
         return tuple(p.value(u) for p, u in zip(self.model.parameters, x, strict=False))
 
     def weights(self) -> list[np.ndarray]:
-        """Return the recordings' own weights, less for rows that a robust fit trusts less."""
+        """Return the recordings' weights, reduced for rows that a robust fit trusts less."""
         return [part.weight * robust for part, robust in zip(self.parts, self._robust, strict=True)]
 
     def predicted(self, x: np.ndarray) -> list[np.ndarray]:
-        """Return the readings of each part, without a map of their own; zeros where no sensor has such parameters."""
+        """Return the readings of each part, without their maps; zeros where no sensor has such parameters."""
         try:
             self.model.set(self.values(x))
         except InfeasibleError:
@@ -165,7 +165,7 @@ class Problem:
         return p.start + part * np.copysign(size, reach)
 
     def solve(self, x: np.ndarray, weights: Weights, are_fixed: bool = False) -> Solution:
-        """Return the solution at x, what is linear solved for, but linear parameters if `are_fixed`."""
+        """Return the solution at x with linear unknowns solved for, except linear parameters if `are_fixed`."""
         root = [np.sqrt(w) / sigma for w, sigma in zip(weights, self.sigma, strict=True)]
         x, base = self._solve_linear(x.copy(), root) if self.linear and not are_fixed else (x.copy(), self.predicted(x))
         predicted, coefficients, residuals = [], [], []
@@ -202,7 +202,7 @@ class Problem:
         return x, base
 
     def _projected(self, i: int, value: np.ndarray, root: np.ndarray) -> np.ndarray:
-        """Return weighted numbers less what a part's own map can explain of them."""
+        """Return weighted numbers, without the component that a part's map explains."""
         columns, value = self.parts[i].columns * root[:, None], value * root
         return value - columns @ np.linalg.lstsq(columns, value, rcond=None)[0]
 
@@ -227,10 +227,10 @@ class Problem:
 
         Args:
             x: The start.
-            weights: Weights of each part; default: the recordings' own.
-            fixed: Unknowns that stay as they are.
-            are_fixed: Whether linear parameters are searched as the others are, not solved for.
-            max_steps: Most steps.
+            weights: Weights of each part; default: the recordings'.
+            fixed: Unknowns that stay constant.
+            are_fixed: Whether linear parameters are searched like the others, not solved for.
+            max_steps: Largest number of steps.
         """
         weights = self.weights() if weights is None else weights
         solved = () if are_fixed else self.linear
@@ -280,7 +280,7 @@ class Problem:
             self.sigma[i] = max(part.target.floor, _rms(error, part.weight * self._robust[i]), 1e-6 * self.rms(i))
 
     def alone(self) -> list[np.ndarray]:
-        """Return what each part's own map explains without any sensor."""
+        """Return the part of each target that its map explains without any sensor."""
         result = []
         for part in self.parts:
             root = np.sqrt(part.weight)
@@ -298,14 +298,14 @@ def _clock(target: Target) -> str:
 
 
 def _places(model: Model, reading: str) -> np.ndarray | None:
-    """Return where a reading's rows are in their link's frame (row, 3) [m]; None if they have no place."""
+    """Return the positions of a reading's rows in their link's frame (row, 3) [m]; None without positions."""
     table = model.module.rows.get(reading)
     is_stacked = any(output.name == reading and len(output.shape) > 2 for output in model.module.outputs)
     return None if table is None or is_stacked or "pos" not in (table.dtype.names or ()) else np.asarray(table["pos"])
 
 
 def _part(i: int, target: Target, reading: ReadingMap, places: np.ndarray | None, model: Model) -> Part:
-    """Return a target with the columns of its own map."""
+    """Return a target with the columns of its map."""
     output = next(output for output in model.module.outputs if output.name == target.reading)
     channels = [output.channels[channel] for channel in target.channels]
     samples, rows, num = target.value.shape
@@ -339,11 +339,11 @@ def _nuisances(i: int, recording: Recording, model: Model) -> list[Nuisance]:
         bodies = model.module.inputs.names["body"] if name in ("body_pos", "body_quat") else ()
         for index in map(tuple, np.argwhere(width > 0).tolist()):
             step, *rest = index
-            what = f"{bodies[rest[0]]}" if bodies else str(rest[0])
+            item = f"{bodies[rest[0]]}" if bodies else str(rest[0])
             axis = "" if len(rest) < 2 else f".{'xyz'[rest[1]]}" if name == "body_pos" else f"[{rest[1]}]"
             when = "" if len(width) == 1 else f"@{step}"
             place = (-1 if len(width) == 1 else step, *rest)
-            result.append(Nuisance(f"{recording.name}: {name} {what}{axis}{when}", i, name, place, float(width[index])))
+            result.append(Nuisance(f"{recording.name}: {name} {item}{axis}{when}", i, name, place, float(width[index])))
     for target in recording.targets:
         if target.clock_width > 0:
             result.append(Nuisance(f"{recording.name}: clock of {target.reading}", i, _clock(target), None, target.clock_width))

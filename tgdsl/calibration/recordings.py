@@ -141,7 +141,7 @@ def _arrays(source: str | Path | Arrays, name: str) -> dict[str, np.ndarray]:
 
 @dataclass
 class _Reader:
-    """Reads one recording and notes all that is wrong with it; what is wrong is read as an empty array, or None."""
+    """Reads one recording and collects its mistakes; a wrong entry is read as an empty array, or None."""
 
     name: str
     arrays: dict[str, np.ndarray]
@@ -162,17 +162,17 @@ class _Reader:
         return len(bad) > 0
 
     def recording(self) -> Recording:
-        known = {"time", *SHAPES, *NAMES_OF.values(), *(f"width:{name}" for name in SHAPES)}
-        known |= {f"{what}:{name}" for what in OF_TARGET for name in self.outputs}
+        valid_keys = {"time", *SHAPES, *NAMES_OF.values(), *(f"width:{name}" for name in SHAPES)}
+        valid_keys |= {f"{prefix}:{name}" for prefix in OF_TARGET for name in self.outputs}
         for key in self.arrays:
-            what, _, name = key.partition(":")
-            if key not in known and (what not in OF_TARGET[1:] or f"target:{name}" not in self.arrays):
-                self.note(key, "unknown key", did_you_mean(key, known, "keys"))
+            prefix, _, name = key.partition(":")
+            if key not in valid_keys and (prefix not in OF_TARGET[1:] or f"target:{name}" not in self.arrays):
+                self.note(key, "unknown key", did_you_mean(key, valid_keys, "keys"))
         time = self._clock("time", "clock of the states")
-        wanted = [name for name in self.inputs.fields if name != "dt"]
-        fields = {name: self._field(name, len(time)) for name in wanted if name in self.arrays}
-        for name in wanted:
-            if name not in fields and DERIVED.get(name) not in {*self.arrays, *wanted}:
+        needed = [name for name in self.inputs.fields if name != "dt"]
+        fields = {name: self._field(name, len(time)) for name in needed if name in self.arrays}
+        for name in needed:
+            if name not in fields and DERIVED.get(name) not in {*self.arrays, *needed}:
                 hint = "gate: geometric needs no contacts; " if name.startswith("contact_") else ""
                 self.note(name, "this field is missing", f"{hint}the module reads {', '.join(self.inputs.fields)}")
         widths = {name: self._width(name, value) for name, value in fields.items() if f"width:{name}" in self.arrays}
@@ -226,11 +226,11 @@ class _Reader:
         names = [str(name) for name in self.arrays[key]]
         for twice in sorted(name for name in set(names) if names.count(name) > 1):
             self.note(key, f'"{twice}" stands there {names.count(twice)} times', "expected each name once")
-        for wanted in self.inputs.names[axis]:
-            if wanted not in names:
-                self.note(key, f'"{wanted}" is missing', did_you_mean(wanted, names, "names"))
+        for needed in self.inputs.names[axis]:
+            if needed not in names:
+                self.note(key, f'"{needed}" is missing', did_you_mean(needed, names, "names"))
                 return value
-        return value[:, [names.index(wanted) for wanted in self.inputs.names[axis]]] if value.shape[1] == len(names) else value
+        return value[:, [names.index(needed) for needed in self.inputs.names[axis]]] if value.shape[1] == len(names) else value
 
     def _width(self, name: str, value: np.ndarray) -> np.ndarray:
         key = f"width:{name}"
@@ -303,20 +303,20 @@ class _Reader:
 
     def _unit(self, name: str, output: Output) -> tuple[float, str]:
         """Return the factor from the target's unit to the reading's, and the latter."""
-        key, wanted = f"unit:{name}", output.units[0]
-        written, symbol = str(self.arrays.get(key, "")), wanted.replace("·", "*")
-        known = next((units for units in UNITS.values() if symbol in units), {})
-        if written == wanted:
-            return 1.0, wanted
-        if written in known:
-            return known[written] / known[symbol], wanted
+        key, unit = f"unit:{name}", output.units[0]
+        written, symbol = str(self.arrays.get(key, "")), unit.replace("·", "*")
+        factors = next((units for units in UNITS.values() if symbol in units), {})
+        if written == unit:
+            return 1.0, unit
+        if written in factors:
+            return factors[written] / factors[symbol], unit
         if not written:
-            hint = f'the reading is in {wanted}: expected "{wanted}" or one like it'
+            hint = f'the reading is in {unit}: expected "{unit}" or one like it'
             self.note(key, "the unit of the target is missing", hint)
         else:
-            hint = f"expected one of {', '.join(known) or wanted}"
-            self.note(key, f'"{written}" is no unit of this reading, which is in {wanted}', hint)
-        return 1.0, wanted
+            hint = f"expected one of {', '.join(factors) or unit}"
+            self.note(key, f'"{written}" is no unit of this reading, which is in {unit}', hint)
+        return 1.0, unit
 
     def _scalar(self, key: str) -> float | None:
         if key not in self.arrays:

@@ -6,7 +6,7 @@
       time: t                              # a column by its name in the first line, or by its number from 0
       unit: mm
       position: {ball: [x, y, z], pad: [0 m, 0 m, 0 m]}    # columns, or fixed numbers with a unit
-      orientation: {ball: [qw, qx, qy, qz]}    # default: that of the world
+      orientation: {ball: [qw, qx, qy, qz]}    # default: the world's axes
     targets:
       load:
         file: scale.csv
@@ -61,7 +61,7 @@ class StatesSpec(SpecModel):
 
 
 class TargetSpec(SpecModel):
-    """What a sensor read, in a CSV file."""
+    """Readings of a sensor, in a CSV file."""
 
     file: str
     """The file, relative to this one."""
@@ -91,11 +91,11 @@ class TablesSpec(SpecModel):
     states: StatesSpec
     """Poses of the bodies."""
     targets: Annotated[dict[str, TargetSpec], Field(min_length=1)]
-    """What sensors read, by the reading's name."""
+    """Readings of sensors, by name."""
 
 
 class _Table:
-    """A CSV file's numbers, and the mistakes in the columns that were read.
+    """A CSV file's numbers, and the mistakes in the columns read so far.
 
     Attributes:
         path: The file.
@@ -113,8 +113,8 @@ class _Table:
         except (OSError, UnicodeDecodeError, csv.Error) as error:
             raise SpecError([Problem(str(path), 0, 0, "", f"cannot be read as CSV: {error}")]) from error
         if self.lines and len(first := self.lines[0][1]) == 1:
-            what = f'found one column, "{first[0]:.40}"'
-            raise SpecError([Problem(str(path), 1, 1, "", what, "expected commas between columns")])
+            problem = f'found one column, "{first[0]:.40}"'
+            raise SpecError([Problem(str(path), 1, 1, "", problem, "expected commas between columns")])
         if self.lines and any(cell and _number(cell) is None for cell in self.lines[0][1]):
             self.names = self.lines.pop(0)[1]
         if not self.lines:
@@ -122,8 +122,8 @@ class _Table:
         width = len(self.names or self.lines[0][1])
         for line, cells in self.lines:
             if any(cells[width:]):
-                what = f"found {len(cells)} columns, expected {width}"
-                raise SpecError([Problem(str(self.path), line, width + 1, "", what, "write decimals with a point")])
+                problem = f"found {len(cells)} columns, expected {width}"
+                raise SpecError([Problem(str(self.path), line, width + 1, "", problem, "write decimals with a point")])
 
     def column(self, which: Column, invalid: Sequence[float] | None = None) -> Float[np.ndarray, " line"]:
         """Return a column's numbers; NaN where one is missing or in `invalid`: a mistake if that is None."""
@@ -131,8 +131,8 @@ class _Table:
         if isinstance(which, str) and self.names.count(which) != 1:
             has_hint, numbers = self.names and which not in self.names, f"number them from 0 to {width - 1}"
             hint = did_you_mean(which, self.names, "columns") if has_hint else numbers
-            what = f'column "{which}" stands twice' if which in self.names else f'there is no column "{which}"'
-            self.problems.append(Problem(str(self.path), 1, 1, "", what, hint))
+            problem = f'column "{which}" stands twice' if which in self.names else f'there is no column "{which}"'
+            self.problems.append(Problem(str(self.path), 1, 1, "", problem, hint))
             return np.zeros(len(self.lines))
         place = self.names.index(which) if isinstance(which, str) else which
         if place >= width:
@@ -144,8 +144,8 @@ class _Table:
             value = _number(cell) if cell else np.nan
             is_missing = value is None or not np.isfinite(value) or value in (invalid or ())
             if value is None or (is_missing and invalid is None):
-                what = f"column {which}: " + (f'found "{cell}", expected a number' if cell else "this cell is empty")
-                self.problems.append(Problem(str(self.path), line, place + 1, "", what))
+                problem = f"column {which}: " + (f'found "{cell}", expected a number' if cell else "this cell is empty")
+                self.problems.append(Problem(str(self.path), line, place + 1, "", problem))
                 break  # of each column the first
             result[i] = np.nan if is_missing else value
         return result
@@ -159,7 +159,7 @@ def _number(cell: str) -> float | None:
 
 
 def read_tables(path: str | Path) -> dict[str, Any]:
-    """Return the recording that a YAML document and its CSV files hold, with the keys of an `.npz` recording.
+    """Return the recording of a YAML document and its CSV files, with the keys of an `.npz` recording.
 
     Raises:
         SpecError: All mistakes in the document, or in the files, by line and column.

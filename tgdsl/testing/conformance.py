@@ -37,8 +37,8 @@ from tgdsl.testing.reference import KnownReference, answers_of, assert_agrees
 
 FLOAT32_TOLERANCE = 1e-5
 """Largest error of a float32 module over the largest magnitude of the channel: some 80 roundings of 2⁻²⁴."""
-FLOAT64_TOLERANCE = 1e-12  # the same for float64: room for the 1e-15 of its rounding, times the conditioning of a thin depth
-FAR_TOLERANCE = 1e-9  # the same at 1 km from the origin, where a float64 position is known to 1e-13 m
+FLOAT64_TOLERANCE = 1e-12  # the same for float64: rounding of 1e-15 times the conditioning of a thin depth
+FAR_TOLERANCE = 1e-9  # the same at 1 km from the origin, where float64 positions are rounded to 1e-13 m
 
 SCENE = """
 <mujoco model="conformance">
@@ -62,7 +62,7 @@ SCENE = """
 
 
 def conformance_points(num: int, seed: int) -> list[dict[str, Any]]:
-    """Return probes all over a link-sized ball, some of them inactive."""
+    """Return probes in a link-sized ball, some of them inactive."""
     rng = np.random.default_rng(seed)
     directions = rng.normal(size=(num, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -96,28 +96,28 @@ def _specs_of(document: str, kinds: tuple[Kind, ...]) -> Mapping[str, Any]:
 
 
 class KindConformance:
-    """Inherit this in a test class and set `kind`, and `parameters` if its defaults are not what should be tested."""
+    """Inherit this in a test class and set `kind`, and `parameters` to test other values than the defaults."""
 
     kind: ClassVar[Kind]
     """The kind under test."""
     parameters: ClassVar[Mapping[str, Any]] = {}
-    """Fields of the sensor, beside `kind`, `links` and `feels`."""
+    """Fields of the sensor other than `kind`, `links` and `feels`."""
     num_envs: ClassVar[int] = 12
     num_steps: ClassVar[int] = 3
     float32_tolerance: ClassVar[float] = FLOAT32_TOLERANCE
     float64_tolerance: ClassVar[float] = FLOAT64_TOLERANCE
     is_differentiable: ClassVar[bool] = True
-    """Whether readings follow poses smoothly, away from ties."""
+    """Whether readings are differentiable in the poses, away from ties."""
     rest: ClassVar[float | tuple[float, ...]] = 0.0
-    """Reading where nothing is near, for all channels or for each."""
+    """Reading far from objects, for all channels or for each."""
     gates: ClassVar[tuple[str, ...]] = ("contact_pair", "geometric")
-    """Gates that the kind knows; empty if it has none."""
+    """Gates that the kind supports; empty if it has none."""
     others: ClassVar[Mapping[str, tuple[Kind, Mapping[str, Any]]]] = {}
-    """Sensors that it reads, by name: kind, and fields of the sensor beside `kind`."""
+    """Sensors that it reads, by name: kind, and the other fields of the sensor."""
 
     @pytest.fixture
     def scene(self, tmp_path_factory: pytest.TempPathFactory) -> Path:
-        """The conformance scene, as a file: the same for all tests, so that plans can be taken again."""
+        """The conformance scene, as a file: the same for all tests, so that plans can be reused."""
         path = tmp_path_factory.getbasetemp() / "conformance.xml"
         path.write_text(SCENE)
         return path
@@ -128,30 +128,30 @@ class KindConformance:
         return self._with_others(conformance_document(scene, {**self.sensor(), **changes}, palm, tip))
 
     def _with_others(self, document: dict[str, Any]) -> dict[str, Any]:
-        """Return a document with the sensors that the one under test reads, and without links of one that has none."""
+        """Return a document with the sensors that the tested one reads, and without `links` if its kind has none."""
         if "links" not in self.kind.spec.model_fields:
             del document["sensors"]["s"]["links"]
         document["sensors"] |= {name: {"kind": kind.name, **fields} for name, (kind, fields) in self.others.items()}
         return document
 
     def sensor(self) -> dict[str, Any]:
-        """Return the sensor under test; one that feels objects feels all of the scene."""
+        """Return the sensor under test; if it has `feels`, with all objects of the scene."""
         feels = {"feels": ["item", "tool", "floor"]} if "feels" in self.kind.spec.model_fields else {}
         return {"kind": self.kind.name, **feels, **self.parameters}
 
     def build(self, document: dict[str, Any], dtype: torch.dtype) -> tuple[TactileModule, ReferenceModule]:
-        """Return a document's module, and its reference; a plan that the class has made before is taken again."""
+        """Return a document's module, and its reference; plans are cached."""
         plan = _plan_of(json.dumps(document), self._extra())
         return TactileModule(plan, self._known(), dtype), self.reference(plan, document)
 
     def reference(self, plan: Plan, document: dict[str, Any]) -> ReferenceModule:
         """Return a document's reference."""
         specs = _specs_of(json.dumps(document), self._extra())
-        others = {name: (kind, specs[name]) for name, (kind, _) in self.others.items()}
-        return KnownReference(answers_of(type(self), json.dumps(document)), plan, self.kind, specs["s"], others)
+        upstream = {name: (kind, specs[name]) for name, (kind, _) in self.others.items()}
+        return KnownReference(answers_of(type(self), json.dumps(document)), plan, self.kind, specs["s"], upstream)
 
     def states(self, module: TactileModule, num_envs: int | None = None) -> Iterator[SceneState]:
-        """Yield the states that tests run through: different poses, one after the other."""
+        """Yield the tests' states: different poses, one after the other."""
         for step in range(self.num_steps):
             yield module.example_state(num_envs or self.num_envs, seed=step)
 
@@ -165,7 +165,7 @@ class KindConformance:
         return tuple(kind for kind in (self.kind, *(kind for kind, _ in self.others.values())) if kind not in KINDS)
 
     def test_something_is_felt(self, scene: Path) -> None:
-        """The states of this suite are no empty test: some taxels read, some do not."""
+        """The states of this suite load some taxels and leave others unloaded."""
         module, _ = self.build(self.document(scene), torch.float64)
         share = torch.stack(
             [
@@ -186,7 +186,7 @@ class KindConformance:
                 assert_agrees(module(state)["s"], reference, state, self.float64_tolerance)
 
     def test_float32_equals_reference(self, scene: Path) -> None:
-        """A float32 module that is given float64 poses loses no more than float32 must, under each gate."""
+        """A float32 module with float64 poses is as accurate as float32 allows, under each gate."""
         for gate in self._gates():
             module, reference = self.build(self.document(scene, **gate), torch.float32)
             for state in self.states(module):
@@ -199,7 +199,7 @@ class KindConformance:
     def test_rigid_motion_changes_nothing(
         self, scene: Path, dtype: torch.dtype, tolerance: float | None, distance: float
     ) -> None:
-        """The same scene elsewhere and turned reads the same, also 1 km from the origin."""
+        """The moved and turned scene reads the same, also 1 km from the origin."""
         module, reference = self.build(self.document(scene), dtype)
         turn = Rotation.from_rotvec([0.3, -1.1, 0.7])
         for state in self.states(module):
@@ -208,7 +208,7 @@ class KindConformance:
             assert_agrees(readings, reference, state, allowed)
 
     def test_batch_equals_singles(self, scene: Path) -> None:
-        """An environment does not see the others."""
+        """An environment's readings do not depend on the other environments."""
         module, _ = self.build(self.document(scene), torch.float64)
         singles = [self.build(self.document(scene), torch.float64)[0].seed(0, first_env=i) for i in range(3)]
         for state in self.states(module, num_envs=3):
@@ -217,7 +217,7 @@ class KindConformance:
             torch.testing.assert_close(together, alone, rtol=1e-13, atol=1e-13)
 
     def test_taxel_permutation_commutes(self, scene: Path) -> None:
-        """The order of taxels is the layout's and has no other effect."""
+        """A permutation of the layout's taxels permutes the readings, with no other effect."""
         palm, tip = conformance_points(18, 1), conformance_points(9, 2)
         order = np.random.default_rng(3).permutation(18)
         sensor = self.sensor()
@@ -226,15 +226,15 @@ class KindConformance:
         second, _ = self.build(self._with_others(turned), torch.float64)
         for state in self.states(first):
             expected = first(state)["s"]
-            found = second(state)["s"]
+            permuted = second(state)["s"]
             if first.outputs[0].rows != "taxel":
-                torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-13)
+                torch.testing.assert_close(permuted, expected, rtol=1e-12, atol=1e-13)
                 continue
-            torch.testing.assert_close(found[:, :18], expected[:, :18][:, order], rtol=1e-13, atol=1e-13)
-            torch.testing.assert_close(found[:, 18:], expected[:, 18:], rtol=1e-13, atol=1e-13)
+            torch.testing.assert_close(permuted[:, :18], expected[:, :18][:, order], rtol=1e-13, atol=1e-13)
+            torch.testing.assert_close(permuted[:, 18:], expected[:, 18:], rtol=1e-13, atol=1e-13)
 
     def test_no_contact_gives_the_rest_value(self, scene: Path) -> None:
-        """Without contact pairs nothing is felt, and far away neither; inactive taxels never feel."""
+        """Readings are `rest` without contact pairs and far away; inactive taxels always read `rest`."""
         for gate in self._gates():
             module, _ = self.build(self.document(scene, **gate), torch.float32)
             rest = torch.tensor(self.rest, dtype=torch.float32)
@@ -258,14 +258,14 @@ class KindConformance:
 
     def _assert_rests(self, readings: Tensor, rest: Tensor, what: str) -> None:
         """Assert that readings are the rest value to the last bit."""
-        others = readings[(readings != rest).any(dim=-1)]
-        assert not len(others), (
-            f"{what} read {others[0].tolist()}, expected `rest`, which is {rest.tolist()} in float32, to the last bit; "
+        active_rows = readings[(readings != rest).any(dim=-1)]
+        assert not len(active_rows), (
+            f"{what} read {active_rows[0].tolist()}, expected `rest`, which is {rest.tolist()} in float32, to the last bit; "
             "where that is rounding, write `forward` so that it is exact there, such as rest * (d0 / d)"
         )
 
     def test_a_broken_pose_is_seen(self, scene: Path) -> None:
-        """Not-a-number in a pose comes out as not-a-number, not as no contact."""
+        """NaN in a pose gives NaN readings, not a missing contact."""
         module, _ = self.build(self.document(scene, **self._gates()[-1]), torch.float32)
         state = module.example_state(2)
         assert state.body_pos is not None
@@ -279,7 +279,7 @@ class KindConformance:
         assert readings[1].isnan().any()
 
     def test_gradients_equal_finite_differences(self, scene: Path) -> None:
-        """Derivatives with respect to poses and contacts are those of the readings; where readings jump they are finite."""
+        """Gradients by poses and contacts match finite differences of the readings; at jumps they are finite."""
         module, _ = self.build(self.document(scene), torch.float64)
         state = module.example_state(2)
         names = [name for name in module.inputs.fields if name.startswith(("body_", "contact_")) and name != "contact_found"]
@@ -301,7 +301,7 @@ class KindConformance:
                 assert gradient is None or torch.isfinite(gradient).all()
 
     def test_gradients_of_parameters_equal_finite_differences(self, scene: Path) -> None:
-        """Derivatives with respect to the kind's scalar constants are those of the readings; all of them are finite."""
+        """Gradients by the kind's scalar constants match finite differences of the readings, and are finite."""
         module, _ = self.build(self.document(scene), torch.float64)
         state = module.example_state(2)
         paths = [f"sensors/s/{name}" for name in module.plan.sensors[0].constants]
@@ -327,11 +327,11 @@ class KindConformance:
         other, _ = self.build(self.document(scene), torch.float64)
         first, second, *_ = self.states(module, num_envs=4)
         untouched = [module(first), module(second)][1]["s"]
-        for chosen in (torch.tensor([2]), torch.tensor([False, False, True, False])):
+        for selection in (torch.tensor([2]), torch.tensor([False, False, True, False])):
             module.reset()
-            module.seed(0)  # whoever draws numbers draws those of the first calls again
+            module.seed(0)  # random numbers repeat from the first call on
             module(first)
-            module.reset(chosen)
+            module.reset(selection)
             readings = module(second)["s"]
             torch.testing.assert_close(readings[[0, 1, 3]], untouched[[0, 1, 3]], rtol=0, atol=0)
             other.seed(0)
@@ -340,7 +340,7 @@ class KindConformance:
             torch.testing.assert_close(readings[2], other(second)["s"][2], rtol=0, atol=0)
 
     def test_plan_survives_a_file(self, scene: Path, tmp_path: Path) -> None:
-        """Plan to file to plan is the identity, and the same plan is the same bytes."""
+        """Saving and loading a plan is the identity, and equal plans give equal bytes."""
         module, _ = self.build(self.document(scene), torch.float32)
         save_plan(module.plan, tmp_path / "a.safetensors")
         again = load_plan(tmp_path / "a.safetensors", quantities_of(self._known()))
@@ -352,7 +352,7 @@ class KindConformance:
         torch.testing.assert_close(TactileModule(again, self._known())(state)["s"], module(state)["s"], rtol=0, atol=0)
 
     def test_state_dict_goes_on_where_it_stopped(self, scene: Path) -> None:
-        """A module that loads another's state dict reads what the other would have read."""
+        """A module that loads another's state dict continues with the same readings."""
         module, _ = self.build(self.document(scene), torch.float64)
         first, second, *_ = self.states(module)
         module(first)
@@ -361,7 +361,7 @@ class KindConformance:
         torch.testing.assert_close(resumed(second)["s"], module(second)["s"], rtol=0, atol=0)
 
     def test_compiled_equals_eager(self, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        """One graph, traced whole, gives the eager readings for every batch size, with state; no kernels are generated."""
+        """One full graph gives the eager readings for every batch size, with state; no kernels are generated."""
         monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
         eager, reference = self.build(self.document(scene), torch.float32)
         torch.compiler.reset()

@@ -1,4 +1,4 @@
-"""What it means that a module agrees with its kind's float64 reference, whose answers a suite computes once."""
+"""Comparison of a module with its kind's float64 reference, whose readings a suite computes once."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["assert_agrees", "full_scale_error"]
 
 
 def assert_agrees(found: Tensor, reference: ReferenceModule, state: SceneState, tolerance: float) -> None:
-    """Assert that readings equal the reference's, at ties that of one side; the reference then remembers this state."""
+    """Assert that readings equal the reference's, at ties either side's; the reference's memory then advances."""
     worst = row_errors(found, reference, state, tolerance)
     env, *_, row = np.unravel_index(int(worst.argmax()), worst.shape)
     assert worst.max() <= tolerance, f"error {worst.max():.2e} of full scale in environment {env}, row {row}"
@@ -27,29 +27,29 @@ def assert_agrees(found: Tensor, reference: ReferenceModule, state: SceneState, 
 
 @functools.lru_cache(maxsize=8)
 def answers_of(suite: type, document: str) -> dict[bytes, Any]:
-    """Return what the reference of a suite's document has answered so far, by what it was asked."""
+    """Return the cache of readings of a suite's reference for a document, by digest of the call's arguments."""
     return {}
 
 
 class KnownReference(ReferenceModule):
-    """A reference that computes each answer once for a whole suite, whose tests ask for readings of the same states."""
+    """A reference that computes each state's readings once for a whole suite."""
 
     def __init__(self, answers: dict[bytes, Any], *arguments: Any) -> None:
         super().__init__(*arguments)
         self._answers = answers
 
     def __call__(self, state: SceneState, shift: np.ndarray) -> tuple[np.ndarray, dict[int, dict[str, np.ndarray]]]:
-        """Return what the reference does: a copy of it where it was asked that before."""
-        if self.upstream:  # those remember too
+        """Return the reference's readings and memory, as a copy if they are cached."""
+        if self.upstream:  # upstream references have memory too
             return super().__call__(state, shift)
-        asked = _digest(state, shift, self.num_calls, self.memory)
-        if asked not in self._answers:
-            self._answers[asked] = super().__call__(state, shift)
-        return copy.deepcopy(self._answers[asked])
+        key = _digest(state, shift, self.num_calls, self.memory)
+        if key not in self._answers:
+            self._answers[key] = super().__call__(state, shift)
+        return copy.deepcopy(self._answers[key])
 
 
 def _digest(*values: Any) -> bytes:
-    """Return a digest of states, dictionaries, sequences, tensors, arrays and plain values: of all that is in them."""
+    """Return a digest of the content of states, dictionaries, sequences, tensors, arrays and plain values."""
     result = hashlib.sha256()
 
     def add(value: Any) -> None:

@@ -1,11 +1,11 @@
-"""Fits what a fingertip's counts mean to forces that are known: force = rotation · (scale ∘ (counts − tare)).
+"""Fit of a fingertip's counts to known forces: force = rotation · (scale ∘ (counts − tare)).
 
 Rotation and scale minimise the sum of squared errors of the force, in turn: the rotation by Procrustes' problem (Schönemann,
-*Psychometrika* 31, 1966), which also finds mirrored axes, the scales each by linear least squares. Starts at the linear map of
-least squares. Where the axes are known to be parallel to the link's, each axis is a straight line.
+*Psychometrika* 31, 1966), which also finds mirrored axes, the scales each by linear least squares. The start is the linear
+least-squares map. If the axes are known to be parallel to the link's, each axis is a straight line.
 
 Shapes: `sample` readings used, `axis` x, y, z along the link (or, for scale and tare, along the sensor), `step` the instants
-at which a force is known, `component` those of one or more fingertips.
+at which a force is known, `component` force components of one or more fingertips.
 """
 
 from __future__ import annotations

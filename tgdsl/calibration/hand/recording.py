@@ -1,7 +1,7 @@
 """A log of a real XHand1 as a recording: the links' poses follow from its joint angles, and each fingertip is a load cell.
 
-The hand knows neither where it stands nor where objects are. The scene says both, so neither may move: an object is a fixture
-that is bolted down beside the hand. See `calibration.recordings` for the format.
+A log has no poses of the hand's base and of objects. They come from the scene, so neither may move: an object is a fixture
+bolted down near the hand. See `calibration.recordings` for the format.
 
 Shapes: `step` readings of the log; `body` and `joint` as in the module's inputs.
 """
@@ -41,9 +41,9 @@ def recording_of(log: HandLog, touch: TactileModule) -> Arrays:
         problems.append(Problem(str(log.path), 0, 0, "", "the log's forces are counts, expected newtons", hint))
     targets = {output.name: finger for output in touch.outputs if (finger := _finger_of(output)) is not None}
     if not targets:
-        what = "no reading is the force on the taxels of one fingertip, which is all that a log has"
-        found = listed([output.name for output in touch.outputs])
-        problems.append(Problem(str(log.path), 0, 0, "", what, f"the document has {found}"))
+        problem = "no reading is the force on the taxels of one fingertip, which is all that a log has"
+        names_of_readings = listed([output.name for output in touch.outputs])
+        problems.append(Problem(str(log.path), 0, 0, "", problem, f"the document has {names_of_readings}"))
     if problems:
         raise SpecError(problems)
     assert log.calibration is not None

@@ -46,7 +46,7 @@ def calibrated(base: Calibration, fits: Mapping[str, FingerFit], others: str | N
 
 
 def report(fits: Mapping[str, FingerFit], samples: Mapping[str, Samples]) -> list[str]:
-    """Return a line per fit and axis: residuals, and what was left out."""
+    """Return a line per fit and axis: residuals, and omitted readings."""
     lines = []
     for name, fit in fits.items():
         finger_samples = samples[name]

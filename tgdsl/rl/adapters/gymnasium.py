@@ -106,19 +106,19 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
         action = torch.as_tensor(actions, dtype=torch.float32, device=self.device)
         obs, reward, terminated, truncated, info = self.touch_env.step(action)
         entries = self._numpy_info(info) if self._is_numpy else self._torch_info(info)
-        return self._obs(obs), self._given(reward), self._given(terminated), self._given(truncated), entries
+        return self._obs(obs), self._output(reward), self._output(terminated), self._output(truncated), entries
 
     def close_extras(self, **_: Any) -> None:
         """Close the environments."""
         self.touch_env.close()
 
-    def _given(self, value: Tensor | Mapping[str, Tensor]) -> Any:
+    def _output(self, value: Tensor | Mapping[str, Tensor]) -> Any:
         if isinstance(value, Mapping):
-            return {name: self._given(part) for name, part in value.items()}
+            return {name: self._output(part) for name, part in value.items()}
         return value.cpu().numpy() if self._is_numpy else value
 
     def _obs(self, obs: Mapping[str, Tensor]) -> dict[str, Any]:
-        return self._given({group: obs[group] for group in self._groups})
+        return self._output({group: obs[group] for group in self._groups})
 
     def _torch_info(self, info: StepInfo) -> dict[str, Any]:
         entries = {name: getattr(info, name) for name in STEP_KEYS}
@@ -128,7 +128,7 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
 
     def _numpy_info(self, info: StepInfo) -> dict[str, Any]:
         ended = info.ended.cpu().numpy()
-        entries = {name: self._given(getattr(info, name)) for name in STEP_KEYS}
+        entries = {name: self._output(getattr(info, name)) for name in STEP_KEYS}
         present = {} if ended.all() else _masked(entries, ~ended)
         if not ended.any():
             return present

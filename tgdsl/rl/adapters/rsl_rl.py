@@ -37,7 +37,7 @@ class TouchVecEnv(VecEnv):
         self.num_envs, self.num_actions = touch_env.num_envs, touch_env.num_actions
         self.max_episode_length = touch_env.max_steps
         self.cfg = touch_env.spec.model_dump(mode="json")
-        self._obs = self._given(touch_env.reset())
+        self._obs = self._tensordict(touch_env.reset())
 
     @property
     def unwrapped(self) -> TouchVecEnv:
@@ -67,7 +67,7 @@ class TouchVecEnv(VecEnv):
 
         `seed` is the seed of all random numbers; default: continue with the current numbers.
         """
-        self._obs = self._given(self.touch_env.reset(seed))
+        self._obs = self._tensordict(self.touch_env.reset(seed))
         return self._obs, {}
 
     def step(
@@ -80,7 +80,7 @@ class TouchVecEnv(VecEnv):
             else 0; and extras, see the top of this page.
         """
         obs, reward, _, truncated, info = self.touch_env.step(actions)
-        self._obs = self._given(obs)
+        self._obs = self._tensordict(obs)
         extras: dict[str, Any] = {"time_outs": truncated}
         if len(ids := info.ended.nonzero()[:, 0]):
             extras["log"] = _log(info, ids)
@@ -90,7 +90,7 @@ class TouchVecEnv(VecEnv):
         """Close the environments."""
         self.touch_env.close()
 
-    def _given(self, obs: Mapping[str, Tensor]) -> TensorDict:
+    def _tensordict(self, obs: Mapping[str, Tensor]) -> TensorDict:
         return TensorDict(dict(obs), batch_size=[self.num_envs], device=self.device)
 
 
