@@ -127,7 +127,7 @@ def test_a_sensor_that_the_document_lacks_is_named(tmp_path):
 def test_a_group_of_links_that_the_layout_lacks_is_named(tmp_path):
     task = write_task(tmp_path, more="placement: finger\n")
     (found,) = problems(lambda: TouchEnv(task, 2))
-    assert found.path == "sensors.touch.links" and '"finger"' in found.what
+    assert (found.path, found.file) == ("placement", str(task)) and found.line > 0 and '"finger"' in found.what
 
 
 def test_a_document_without_a_task_names_those_there_are(tmp_path):
