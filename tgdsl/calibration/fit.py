@@ -35,14 +35,14 @@ from tgdsl.schema.load import read_spec
 from tgdsl.schema.yaml import with_values
 from tgdsl.sensors import Kind
 
-CONTINUED = 3  # starts that are followed to their minimum
+CONTINUED = 3  # starts that are refined to their minimum
 HUBER = 1.345  # residual over its scale from which a row counts less (95 % efficiency for normal noise)
-ROUNDS = 4  # most times that weights of rows and noise of targets are estimated again
+ROUNDS = 4  # largest number of estimates of rows' weights and targets' noise
 
 
 @dataclass(frozen=True)
 class FittedParameter:
-    """A fitted parameter: its value, the ends of its 95 % interval, and whether the data tell it from any other value."""
+    """A fitted parameter: its value, the ends of its 95 % interval, and whether the data identify it."""
 
     parameter: Parameter
     value: float
@@ -163,10 +163,10 @@ def calibrate(
         raise TgdslError(f"hold_out: {hold_out}: each target has one row; expected time or recording")
     solution = _best(problem, starts, seed, robust, progress)
     out = None if hold_out == "none" else checks.held_out(problem, solution, hold_out, folds, seed, progress)
-    known = checks.uncertainty(problem, solution)
-    fitted = _parameters(problem, solution, known, intervals, seed, progress)
+    uncertainty = checks.uncertainty(problem, solution)
+    fitted = _parameters(problem, solution, uncertainty, intervals, seed, progress)
     errors = _errors(problem, solution, out)
-    notes = _warnings(problem, solution, known, fitted, errors)
+    notes = _warnings(problem, solution, uncertainty, fitted, errors)
     model.set(problem.values(solution.x))
     return Fit({f.path: f for f in fitted}, _nuisances(problem, solution), errors, notes, problem, solution)
 
@@ -211,17 +211,17 @@ def _best(problem: Problem, starts: int, seed: int, robust: bool, progress: Prog
 
 
 def _parameters(
-    problem: Problem, solution: Solution, known: Uncertainty, intervals: Intervals, seed: int, progress: Progress
+    problem: Problem, solution: Solution, uncertainty: Uncertainty, intervals: Intervals, seed: int, progress: Progress
 ) -> list[FittedParameter]:
     ends = checks.bootstrap_intervals(problem, solution, seed, progress) if intervals == "bootstrap" else None
     result = []
     for j, parameter in enumerate(problem.model.parameters):
         progress(f"interval of {parameter.path}")
         if intervals == "none":
-            low, high = np.clip(solution.x[j] + np.array([-1.96, 1.96]) * known.sigma[j], 0.0, 1.0)
+            low, high = np.clip(solution.x[j] + np.array([-1.96, 1.96]) * uncertainty.sigma[j], 0.0, 1.0)
         else:
-            low, high = checks.profile_interval(problem, solution, known, j) if ends is None else ends[j]
-        is_identified = bool(high - low < UNKNOWN and known.sigma[j] < UNKNOWN)
+            low, high = checks.profile_interval(problem, solution, uncertainty, j) if ends is None else ends[j]
+        is_identified = bool(high - low < UNKNOWN and uncertainty.sigma[j] < UNKNOWN)
         value = parameter.value(solution.x[j])
         result.append(FittedParameter(parameter, value, parameter.value(low), parameter.value(high), is_identified))
     return result
@@ -252,25 +252,25 @@ def _errors(problem: Problem, solution: Solution, out: Sequence[float] | None) -
 def _warnings(
     problem: Problem,
     solution: Solution,
-    known: Uncertainty,
+    uncertainty: Uncertainty,
     fitted: Sequence[FittedParameter],
     errors: Sequence[TargetErrors],
 ) -> tuple[str, ...]:
-    """Return what the data cannot tell and what speaks against the model, each by name and number."""
+    """Return unidentified parameters and signs of a wrong model, each with name and number."""
     notes, names = [], problem.names
     for j, each in enumerate(fitted):
         parameter, u = each.parameter, solution.x[j]
-        if np.isinf(known.sigma[j]):
+        if np.isinf(uncertainty.sigma[j]):
             notes.append(f"{each.path}: no reading depends on it; leave it out")
         elif not each.is_identified:
             notes.append(f"{each.path}: the data do not tell it: 95 % are {each.low:.4g} to {each.high:.4g} {parameter.unit}")
         if min(u, 1 - u) < 1e-3:
             end = parameter.low if u < 0.5 else parameter.high
             notes.append(f"{each.path}: at the end of its range, {end:.4g} {parameter.unit}")
-    size = known.correlation.shape[0]
+    size = uncertainty.correlation.shape[0]
     for i in range(size):
         for j in range(i + 1, size):
-            rho = known.correlation[i, j]
+            rho = uncertainty.correlation[i, j]
             if i < problem.num_parameters and abs(rho) > CORRELATED:
                 notes.append(f"{names[i]} and {names[j]}: correlation {rho:.3f}, the data tell a combination of both")
     for nuisance, u in zip(problem.nuisances, solution.x[problem.num_parameters :], strict=True):

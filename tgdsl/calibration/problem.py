@@ -140,7 +140,7 @@ class Problem:
         """Find the parameters in which all readings are linear, alone and together; a recording's gain stands for them."""
         if self.gain:
             return
-        base, found = np.concatenate(self.predicted(self.start)), []
+        base, linear = np.concatenate(self.predicted(self.start)), []
 
         def change(*js: int, by: float = 1.0) -> np.ndarray:
             x = self.start.copy()
@@ -153,12 +153,12 @@ class Problem:
             scale = LINEAR * max(float(abs(one).max()), 1e-300)
             if abs(change(j, by=0.5) - 0.5 * one).max() > scale or not one.any():
                 continue
-            if all(abs(change(i, j) - change(i) - one).max() <= LINEAR * abs(change(i, j)).max() for i in found):
-                found.append(j)
-        self.linear = tuple(found)
+            if all(abs(change(i, j) - change(i) - one).max() <= LINEAR * abs(change(i, j)).max() for i in linear):
+                linear.append(j)
+        self.linear = tuple(linear)
 
     def _beside(self, j: int, part: float) -> float:
-        """Return a value of a parameter a part of the way from its start to the farther of its bounds, at most its double."""
+        """Return a parameter's value part of the way from its start to the farther bound, at most twice the start."""
         p = self.model.parameters[j]
         reach = p.high - p.start if p.high - p.start >= p.start - p.low else p.low - p.start
         size = min(abs(reach), abs(p.start) or abs(reach))

@@ -52,7 +52,7 @@ Arrays = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """What a sensor read."""
+    """Readings of a sensor."""
 
     reading: str  # name of the reading
     value: Float[np.ndarray, "sample row channel"]  # in the unit of the reading; 0 where the weight is
@@ -68,13 +68,13 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """States of a scene and what sensors read."""
+    """States of a scene and readings of sensors."""
 
     name: str  # name of its file
     time: Float[np.ndarray, " step"]  # clock of the states [s]
     fields: Arrays  # fields of `SceneState` (step, …), in the order of the module's inputs
     widths: Arrays  # standard deviations of the fields' offsets, (1, …) or (step, …)
-    targets: tuple[Target, ...]  # what sensors read
+    targets: tuple[Target, ...]  # readings of sensors
 
     def state_at(self, time: Float[np.ndarray, " sample"], fields: Arrays) -> dict[str, np.ndarray]:
         """Return fields at other times, linear in between; choices and contacts as at the step before."""

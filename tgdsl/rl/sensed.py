@@ -280,9 +280,9 @@ def sensors_document(loaded: LoadedTask) -> Loaded:
 
 @contextmanager
 def _mistakes_at_keys(loaded: LoadedTask, of_several: bool = False) -> Iterator[None]:
-    """Have mistakes in values that a task sets in the sensors' document stand at the task's keys.
+    """Locate mistakes in values that a task sets in the sensors' document at the task's keys.
 
-    `of_several`: placements and noise are those that several policies feel, not the task's.
+    `of_several`: placements and noise come from several policies' touch, not from the task.
     """
     try:
         yield

@@ -23,25 +23,25 @@ Forces = Float[np.ndarray, "sample 3"]
 AxesModel = Literal["rotation", "signs"]
 
 _LOADED = 0.02
-"""A direction counts as loaded if the forces spread over it by more than this part of what they do along the strongest one."""
+"""Least spread of the forces along a loaded direction, as a share of the spread along the strongest one."""
 _MAX_TURNS = 500
 _SETTLED = 1e-12
 _GRID_S = 0.002
 
 
 class FitError(TgdslError):
-    """Loads that do not say what counts mean: too few, not in all directions, or beyond the sensor's range."""
+    """Loads that do not determine a fit: too few, not in all directions, or beyond the sensor's range."""
 
 
 @dataclass(frozen=True, eq=False)
 class FingerFit:
-    """What a fingertip's counts mean, and how well they say what the force was."""
+    """Fit of a fingertip's counts to forces, and its errors."""
 
     scale: Float[np.ndarray, " axis"]  # N per count along the sensor's axes
     rotation: Float[np.ndarray, "axis axis"]  # from the sensor's axes to the link's; it may mirror
     tare: Float[np.ndarray, " axis"]  # counts without force
-    force: Forces  # the forces that were known, along the link's axes [N]
-    error: Forces  # what the fit says, less that [N]
+    force: Forces  # known forces, along the link's axes [N]
+    error: Forces  # fitted less known forces [N]
 
     @property
     def rms(self) -> Float[np.ndarray, " axis"]:
@@ -149,7 +149,7 @@ def _correlation(time: np.ndarray, size: np.ndarray, known_time: np.ndarray, kno
 
 
 def _expect_loads(force: Forces, has_tare: bool) -> None:
-    """Raise an error that says along which axis, or else in which direction, there was no load."""
+    """Raise an error that names the axis, or else the direction, without load."""
     strength, directions = _spread(force)
     limit = _LOADED * strength.max()
     if strength.min() > limit:

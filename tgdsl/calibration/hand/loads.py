@@ -1,4 +1,4 @@
-"""What a log says of fingertips under known forces: which samples count, and what the forces were.
+"""Samples of a log with known forces on fingertips.
 
 Known are either constant loads over intervals of the log, as a YAML file says, or forces over time, as of a simulation.
 
@@ -42,9 +42,9 @@ class Load(SpecModel):
     finger: Literal["thumb", "index", "middle", "ring", "pinky"]
     """The finger."""
     start: Seconds
-    """From when, after the log's first reading [s]."""
+    """Start, after the log's first reading [s]."""
     end: Seconds
-    """Until when [s]."""
+    """End [s]."""
     force: tuple[Newton, Newton, Newton]
     """The force on the fingertip, along its link's axes [N]."""
 
@@ -61,14 +61,14 @@ class LoadsSpec(SpecModel):
     tgdsl: Literal[1]
     """Version of the grammar."""
     loads: Annotated[tuple[Load, ...], Field(min_length=1)]
-    """The loads; one of [0, 0, 0] is needed for each finger whose tare is to be fitted."""
+    """The loads; the fit of a finger's tare needs one of [0, 0, 0]."""
 
 
 @dataclass(frozen=True, eq=False)
 class TipRecord:
-    """What a log's fingertips read."""
+    """Readings of a log's fingertips."""
 
-    time: Float[np.ndarray, " reading"]  # when each reading was asked for, after the first was here [s]
+    time: Float[np.ndarray, " reading"]  # when each reading was requested, after the first one arrived [s]
     counts: Float[np.ndarray, "reading finger 3"]  # their forces [counts]
     is_saturated: Bool[np.ndarray, "reading finger"]  # whether a component of the force is at the end of its range
     is_taxel_saturated: Bool[np.ndarray, "reading finger taxel"]  # the same of each taxel
@@ -90,7 +90,7 @@ class TipRecord:
 class Samples:
     """Samples of one fingertip with known forces."""
 
-    counts: Forces  # what it read [counts]
+    counts: Forces  # its readings [counts]
     force: Forces  # the force on it, along its link's axes [N]
     num_left_out: int  # samples left out because the sum or a taxel was at the end of its range
     saturated_taxels: tuple[int, ...]  # numbers of the taxels that were

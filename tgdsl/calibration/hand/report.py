@@ -1,4 +1,4 @@
-"""What came of fits: a calibration, lines of text, and a picture."""
+"""Results of fits: a calibration, lines of text, and a picture."""
 
 from __future__ import annotations
 

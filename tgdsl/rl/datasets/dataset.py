@@ -47,7 +47,7 @@ class LinkTaxels:
 
 @dataclass(frozen=True, eq=False)
 class Header:
-    """What all episodes of a dataset have in common."""
+    """Properties that all episodes of a dataset share."""
 
     name: str  # the document, task or log
     task: str  # the task in words

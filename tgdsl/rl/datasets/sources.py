@@ -161,7 +161,7 @@ def of_deployment(
 def of_run(
     file: Path, touch: TactileModule, fps: float | None = None, reading: str | None = None
 ) -> tuple[Header, Iterator[Episode]]:
-    """Return what `tgdsl run` has recorded, an episode per environment; actions are the controls of joints' actuators.
+    """Return episodes of a recording of `tgdsl run`, one per environment; actions are the controls of joints' actuators.
 
     A recording has positions and readings after each step: a frame's action is the next step's.
     """
@@ -204,7 +204,7 @@ def of_run(
 def of_log(
     file: Path, fps: float | None = None, calibration: Calibration | None = None, side: str | None = None
 ) -> tuple[Header, Iterator[Episode]]:
-    """Return what a real hand has said, or an emulated one over its line: the force on each fingertip.
+    """Return the episodes of a log of a real hand, or of an emulated one on its line: the force on each fingertip.
 
     A log does not hold commands: the action is where the joints are a frame later. Where no reading came for 0.1 s, the next
     episode begins.
