@@ -39,7 +39,7 @@ def _refuse_part(path: Path) -> Model:
     raise RobotError(f"{path}: a part that models <include>, and no model; name the file that includes it")
 
 
-MJCF = (".xml", ".mjcf")  # endings of files of which MuJoCo says what is wrong, even where they are no XML
+MJCF = (".xml", ".mjcf")  # endings of files that MuJoCo reports errors for, even where they are no XML
 ROOTS: Mapping[str, Reader] = {"robot": read_urdf, "mujocoinclude": _refuse_part}
 """By the root element of XML; any other is MJCF's."""
 WRITERS: Mapping[str, Writer] = dict.fromkeys((".usda", ".usdc", ".usd"), _write_usd)  # by a file's ending

@@ -21,8 +21,8 @@ from tgdsl.formats.mjcf import mjcf_of, rewrite_meshes
 from tgdsl.formats.model import LEAST_INERTIA, Model
 
 EDGE = 1e-8
-"""A plate's largest moment is the sum of the others. By as much of it [1] a file's rounding may miss that, either way; twice
-as much is then added, so that MuJoCo, which looks at every bit, takes it."""
+"""Relative rounding error of an inertia's triangle inequality in a file [1], as of a plate, whose largest moment is the sum of
+the others; twice as much is added, because MuJoCo's check is exact."""
 LEAST_MASS = 1e-6  # mass of a moving link that has none, and no geometry that MuJoCo could infer it from [kg]
 _PREFIX = re.compile(r"[<\s]([A-Za-z_][\w.-]*):[A-Za-z_]")
 _ROOT = re.compile(r"<robot\b")

@@ -1,8 +1,8 @@
-"""Files that an artefact names: each name is looked at as a place before anything is opened, since anybody may have written it.
+"""Files that an artefact names: paths are checked before any file is opened, because artefacts are untrusted input.
 
-An artefact's scene is text that MuJoCo reads, and MuJoCo opens whatever file a text names. So the text may name only the
-parts and assets that the artefact lists, and the place of an asset is an absolute path without detours, or one below the
-folder of the robots that come with tgdsl, of a file that has the ending of a mesh, a texture, a height field or a skin.
+An artefact's scene is text for MuJoCo, which opens every file that a text names. So the text may name only the artefact's
+parts and assets. An asset's path is absolute or below the folder of tgdsl's robots, without `..`, and has the ending of a
+mesh, a texture, a height field or a skin.
 """
 
 from __future__ import annotations

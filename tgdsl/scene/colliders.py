@@ -23,7 +23,7 @@ INHERITED = (
 
 
 def free_bit(spec: mujoco.MjSpec, who: str, error: type[TgdslError], fields: tuple[str, ...] = ("conaffinity",)) -> int:
-    """Return a bit that no geom collides with; if there is none, an error says who needs it."""
+    """Return a bit that no geom collides with; if there is none, raise an error that names the user of the bit."""
     used = int(np.bitwise_or.reduce([int(getattr(geom, field)) for geom in spec.geoms for field in fields]))
     free = next((1 << bit for bit in range(30, -1, -1) if not used >> bit & 1), None)
     if free is None:

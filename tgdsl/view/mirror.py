@@ -212,7 +212,7 @@ class MirrorStage(Stage):
             self._sink.flush()
 
     def restart(self) -> None:
-        """Leave the loop as it is."""
+        """Do nothing: the loop controls itself."""
 
     def notes(self, env: int) -> Mapping[str, float | str]:
         """Return what the other process notes."""

@@ -410,7 +410,7 @@ def send_picture(client: Any) -> None:
 def record(client: Any, is_over: threading.Event) -> bytes | None:
     """Return a GIF file of a browser's view that plays in real time; None if no frame came.
 
-    Frames are asked for until `is_over` is set, for `VIDEO_SECONDS`, or until the browser is gone.
+    Frames are requested until `is_over` is set, for `VIDEO_SECONDS`, or until the browser disconnects.
     """
     frames: list[tuple[float, Image.Image]] = []
     begin = start = time.monotonic()

@@ -36,7 +36,7 @@ from tgdsl.view.style import DISC_RADIUS, FAINT, INK, new_figure, save_figure
 
 Array = np.ndarray
 COLOURS = ("#0f7fb8", "#e8871e", "#c2315b", "#3a9d5d", "#7a55b0", "#8c6d46", "#d4b106", "#4f5d75")
-HEIGHT = 750  # rows of the file if no size is asked for
+HEIGHT = 750  # default number of rows of the file
 MIN_SIZE = 200  # columns and rows that a file has at least
 _INCHES = 6.0  # the figure's height, whatever its pixels: text scales with it
 _HEAD, _FOOT, _GAP = 0.085, 0.085, 0.03  # parts of the figure's height

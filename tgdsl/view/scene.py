@@ -1,4 +1,4 @@
-"""The robot and the felt objects as pixels, and markers on top.
+"""The robot and the objects of its sensors as pixels, and markers on top.
 
 Shapes: `h` and `w` rows and columns of pixels.
 """
@@ -31,7 +31,7 @@ Paint = Callable[[Array, Array], Array]
 
 
 class RenderedScene(NamedTuple):
-    """The robot and the felt objects as pixels, row 0 at the bottom, and how they were drawn."""
+    """The robot and its sensors' objects as pixels, row 0 at the bottom, with fragments and viewport."""
 
     image: Float[Array, "h w 3"]
     fragments: Fragments

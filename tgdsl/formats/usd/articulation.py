@@ -187,7 +187,7 @@ def exclusions(stage: Stage, joints: Iterable[Joint], geoms: Iterable[Gprim], we
 
 
 class _Filters:
-    """Filters of a stage, by who says so."""
+    """Filters of a stage, by their source."""
 
     def __init__(self, stage: Stage, joints: Iterable[Joint], geoms: Iterable[Gprim]):
         self.stage = stage

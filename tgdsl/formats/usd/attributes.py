@@ -61,7 +61,7 @@ KNOWN_FLAGS = ("gravity", "filterparent")  # flags that USD has attributes for
 class Source:
     """A USD attribute that holds the value of an MJCF attribute."""
 
-    name: str  # the attribute's name; with `is_range`, what precedes `:min` and `:max`
+    name: str  # the attribute's name; with `is_range`, the part before `:min` and `:max`
     unit: str = "1"  # its unit, a key of `units`
     neutral: float | None = None  # a value that counts as unauthored
     is_range: bool = False  # whether two attributes hold the ends of a range

@@ -124,7 +124,7 @@ def constraint_attributes(stage: Stage, joint: Joint) -> dict[str, str]:
 
 
 def _add(stage: Stage, equality: ET.Element, tag: str, prim: Prim, name: str, attributes: Mapping[str, str]) -> None:
-    """Add a constraint under the name that it had, or one like the name given."""
+    """Add a constraint under its original name, or one derived from `name`."""
     taken = {element.get("name") for element in equality}
     unique = str(attr.read_custom(stage, prim, "equality_name") or name)
     while unique in taken:

@@ -287,7 +287,7 @@ class Names:
 
 
 def unique_names(stage: Stage, prims: Iterable[Prim], reserved: Iterable[str] = ()) -> dict[str, str]:
-    """Return a name for each prim path: the authored `tgdsl:name`, or the end of the path, as long as it takes to be unique."""
+    """Return a name for each prim path: the authored `tgdsl:name`, or the shortest unique end of the path."""
     prims, taken = list(prims), Counter(reserved)
     names: dict[str, str] = {}
     for prim in prims:
@@ -372,7 +372,7 @@ KNOWN_SCHEMAS = frozenset(
 )
 """API schemas that are read, or that say nothing of physics."""
 SILENT_SCHEMAS = ("Physx", "Mujoco", "Isaac", "Omni")
-"""What schemas begin with that say nothing of themselves: only their attributes count, which are looked at one by one."""
+"""Prefixes of schemas that have no effect by themselves; their attributes are checked one by one."""
 KNOWN_TYPES = frozenset(
     (
         *("", "Xform", "Scope", "Mesh", "Cube", "Sphere", "Capsule", "Capsule_1", "Cylinder", "Cylinder_1", "Cone", "Plane"),
@@ -382,9 +382,9 @@ KNOWN_TYPES = frozenset(
         *("MjcActuator", "MjcKeyframe", "MjcTendon", "NewtonActuator"),
     )
 )
-"""Types of prims whose properties are looked at."""
+"""Types of prims whose properties are checked."""
 DRAWN_TYPES = ("Shader", "NodeGraph", "GeomSubset", "Camera", "Skel", "Render", "Backdrop", "BlendShape", "Volume", "Field")
-"""What types begin with that are only drawn: their properties are not looked at."""
+"""Prefixes of types that only affect rendering: their properties are not checked."""
 
 
 def note_unread(stage: Stage) -> None:

@@ -1,10 +1,10 @@
 """A hand that closes on an object: servos close its joints, the rest is fixed, the object is between the fingers.
 
-Nothing is asked of the hand's own actuators, which may be of any kind, act through tendons or not be there: they, springs and
-dry friction rest. Each joint that closes has a servo whose force is limited to what presses with about `GRIP` times the
-object's weight at the fingertips; so a joint that is loaded stops, however far its target is. Joints get the rotor inertia
-that MuJoCo's soft contacts need to pass such forces on. The robot and the object weigh nothing, links do not collide with one
-another, and the object moves as through oil, so that it waits for the last finger.
+The hand's own actuators may be of any kind, act through tendons or be absent: they, springs and dry friction are disabled. Each
+closing joint gets a servo. Its force limit presses the fingertips with about `GRIP` times the object's weight, so a loaded
+joint stops, however far its target is. Joints get the rotor inertia that MuJoCo's soft contacts need to transmit such forces.
+The robot and the object weigh nothing, links do not collide with one another, and viscous drag holds the object until the last
+finger arrives.
 """
 
 from __future__ import annotations
@@ -182,7 +182,7 @@ class Sweep:
         return result
 
     def grip(self, origin: Float[np.ndarray, " 3"] | None = None) -> Grip:
-        """Return what the hand meets as it closes, the object's frame at `origin` in the world [m] or where it starts."""
+        """Return the closing hand's contacts, with the object's frame at `origin` in the world [m] or where it starts."""
         sides: dict[int, np.ndarray] = {}
         overlap = -np.inf
         for share in SHARES:

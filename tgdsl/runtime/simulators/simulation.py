@@ -55,23 +55,23 @@ class SimOptions(TypedDict, total=False):
     keyframe: str | None
     """Keyframe to start from; default: the model's own initial state."""
     options: Options | None
-    """Fields of MuJoCo's `mjOption` that are to differ from the scene's, by name and in its units, such as
+    """Fields of MuJoCo's `mjOption` that replace the scene's, by name and in its units, such as
     `{"timestep": 0.005, "cone": "pyramidal", "iterations": 10}`, and `solref` and `solimp` of all contacts."""
     watch: Watch | None
-    """Names of bodies, sites, joints, actuators and pairs that `watched` returns, of the instant of readings."""
+    """Names of bodies, sites, joints, actuators and pairs that `watched` returns, at the instant of readings."""
     per_env: Sequence[str]
     """Properties that may differ between environments: "mass" and "friction" for `properties`, on a GPU also fields of MuJoCo's
     model by name. On the CPU masses and frictions may always differ."""
     on_fault: OnFault
-    """Treatment of environments that diverge, are given controls that are not finite, or, on a GPU, whose search for contacts
-    of convex shapes runs out of room. "raise" (default): `step` raises until they are reset. "reset": they are restarted, in
-    the simulator and in the module; on a GPU without waiting, and each `state` then evaluates all environments once more.
-    "note": the caller looks at `faults` and resets them. All are counted in `fault_counts`, the last two warn once. Pools of
-    MuJoCo Warp that are too small always raise."""
+    """Treatment of environments that diverge, receive controls that are not finite, or, on a GPU, whose search for contacts of
+    convex shapes runs out of room. "raise" (default): `step` raises until they are reset. "reset": they restart, in the
+    simulator and in the module; on a GPU without waiting, and each `state` then evaluates all environments once more. "note":
+    the caller checks `faults` and resets them. `fault_counts` counts all faults; "reset" and "note" warn once. Pools of MuJoCo
+    Warp that are too small always raise."""
     nconmax: int | None
     """On a GPU, capacity for contacts per environment, in a pool that all share; default 48."""
     njmax: int | None
-    """On a GPU, capacity for rows of constraints in each environment; default: what `nconmax` contacts and all limits make."""
+    """On a GPU, capacity for constraint rows per environment; default: enough for `nconmax` contacts and all limits."""
     model: mujoco.MjModel | None
     """A model that replaces the artefact's scene; its objects are the same in all environments. On the CPU it has to
     hold the contact sensors that `tgdsl.instrument` adds."""
@@ -114,7 +114,7 @@ class SubstepStates:
             self._restarted = restarted.clone()
 
     def added_to(self, state: SceneState) -> SceneState:
-        """Return a state with the earlier ones; in environments that have just begun an episode they are as it is."""
+        """Return a state with the earlier ones, which equal it in environments that have just begun an episode."""
         if not self.are_wanted:
             return state
         earlier = [self._mixed(state, then) for then in self._earlier] or [state] * (self._wanted - 1)
@@ -303,8 +303,8 @@ class Simulation(ABC):
         """Advance all environments as `step` does, and yield the state after each physics step, with its `dt`.
 
         For sensors that are read at every physics step: `for state in sim.substates(control): readings = touch(state)`. The
-        controls are set when the first state is asked for, and who stops earlier has made fewer physics steps. With
-        `on_fault="reset"` environments restart after the physics step of their fault, and make the others from there.
+        first iteration sets the controls; leaving the loop early skips the remaining physics steps. With `on_fault="reset"`
+        environments restart after the physics step of their fault, and continue from there.
         """
         self._begin_step(control)
         if self._earlier.are_wanted:
@@ -348,14 +348,14 @@ class Simulation(ABC):
     def reset(self, env_ids: EnvIds | None = None, *, contacts: Contacts = "evaluate", **values: Unpack[StateValues]) -> None:
         """Begin a new episode in some environments (default: all), in the simulator and in the module.
 
-        They start from the keyframe at time 0, then with the values given, as `MjData` after `mj_resetData`, assignments and
-        `mj_forward`. Nothing of the others changes. On a GPU a boolean mask and values that are there are used without
-        waiting; of indices there, the host waits to see them.
+        They start from the keyframe at time 0 with `values` applied, as `MjData` after `mj_resetData`, assignments and
+        `mj_forward`. The other environments do not change. On a GPU a boolean mask and values on the device are used without
+        waiting; for indices on the device, the host waits.
 
-        To look for contacts and their forces costs about a physics step, on a GPU one of all environments. With
-        `contacts="none"` poses and velocities alone follow from where the environments are: until the next step pairs are not
-        in contact and no force acts, `joint_effort` included. A start that was in contact can be stored with what it felt: then
-        `contacts` holds these fields of its state.
+        Evaluating contacts and their forces costs about a physics step, on a GPU one of all environments. With
+        `contacts="none"` only poses and velocities are evaluated: until the next step pairs are not in contact and no force
+        acts, `joint_effort` included. A start in contact can be stored with its contacts: then `contacts` holds these fields
+        of its state.
 
         Args:
             env_ids: Indices, or a boolean mask over environments.

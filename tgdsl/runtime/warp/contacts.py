@@ -132,10 +132,10 @@ def foreign_sensors(model: mujoco.MjModel, inputs: Inputs) -> Int[np.ndarray, " 
 @functools.cache
 @no_type_check
 def _kernel(wp: Any, mjw: Any) -> Any:
-    """Return the kernel: one thread per contact. Arrays that are None are not wanted."""
-    # The normal points from the first geom's body to the second's. MuJoCo's sensor takes it as it is where the first one is
-    # the object. Else it turns the normal and the tangent, but not their cross product, and of force and torque in this frame
-    # the part along that: in the world both are turned, as the normal is.
+    """Return the kernel: one thread per contact. Outputs that are None are skipped."""
+    # The normal points from the first geom's body to the second's. MuJoCo's sensor keeps it if the first one is the object.
+    # Else it negates the normal and the tangent, but not their cross product, and negates force and torque along the latter
+    # in this frame: in the world both change sign, as the normal does.
     wrench_of = contact_force_function(mjw)
     has_adhesion = "contact_adhesion_in" in wrench_of.input_types
     constraint = wp.constant(constraint_contact_bit(mjw))

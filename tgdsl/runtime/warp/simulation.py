@@ -179,7 +179,7 @@ class WarpSimulation(Simulation):
             self._refuse_if_closed()
             was_captured = call.is_captured
             result = call()
-            if call.is_captured:  # what the work notes on the host is as it was when it was captured
+            if call.is_captured:  # a replay runs no Python: restore the host's notes from the capture
                 start = self._start_contacts
                 placed = placed if was_captured else (start.is_placed, dict(start.values))
                 start.is_placed, start.values = placed[0], dict(placed[1])
@@ -388,7 +388,7 @@ class WarpSimulation(Simulation):
         self._has_stale = self._stream.is_capturing
 
     def _note_stale(self) -> None:
-        """Note, on the host, that environments are to be evaluated."""
+        """Note, on the host, that environments need an evaluation."""
         # A user's graph is replayed without the host. Environments put elsewhere inside it are therefore evaluated in it; and
         # once there is one, all others are evaluated at once, as the graph may read them.
         if self._stream.is_capturing:

@@ -41,7 +41,7 @@ class WarpStream:
 
     @property
     def is_capturing(self) -> bool:
-        """Whether torch is capturing a CUDA graph: a user's, into which work goes as it is."""
+        """Whether torch is capturing a user's CUDA graph, which then includes the work directly."""
         return self.device.type == "cuda" and torch.cuda.is_current_stream_capturing()
 
     @contextlib.contextmanager

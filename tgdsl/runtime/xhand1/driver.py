@@ -39,10 +39,10 @@ _CLOSE_TIMEOUT_S = 5.0
 class Reading:
     """One state of the hand."""
 
-    sequence: int  # number of the exchange that brought it; each is larger than the one before
-    requested_at: float  # when it was asked for, on the clock of `time.monotonic` [s]: what it says is not older than this
-    received_at: float  # when it was here [s]
-    state: HandState  # what the hand said
+    sequence: int  # number of its exchange; each is larger than the previous one
+    requested_at: float  # time of the request, on the clock of `time.monotonic` [s]: the state is not older
+    received_at: float  # time of its arrival [s]
+    state: HandState  # state that the hand reported
 
     def age_s(self, now: float | None = None) -> float:
         """Return how old it can be at most [s], now or at a time of `time.monotonic`."""
@@ -229,7 +229,7 @@ class XHand1(Closable):
         """Return the newest reading, each once; wait for it if need be: by default 0.08 s, or as long as two replies may take.
 
         Raises:
-            HandError: What kept a new reading from coming, by name: `HandTimeoutError`, `HandClosedError` and so on.
+            HandError: Why there is no new reading: `HandTimeoutError`, `HandClosedError` and so on.
         """
         reader, wait_s = self._reader, self._read_timeout_s if timeout_s is None else timeout_s
         with reader.changed:

@@ -1,12 +1,12 @@
-"""Logs of the real hand: every reading bit for bit, every failure, what the counts mean and whose they are, as one `.npz` file.
+"""Logs of the real hand in one `.npz` file: every reading bit for bit, every failure, the hand's identity and calibration.
 
 Arrays of the file, readable with `numpy.load`:
 
 - `sequence`, `requested_at`, `received_at` (reading,): number of the exchange, and its times [s] on the clock of
   `time.monotonic` of the computer that recorded;
 - one array (reading, …) for each attribute of `HandState`, by its name, value for value;
-- `fault_time`, `fault_kind`, `fault_message`, `fault_reading` (fault,): when no reading came, as which error, what that said,
-  and how many readings had come before;
+- `fault_time`, `fault_kind`, `fault_message`, `fault_reading` (fault,): time of each failure, its error class and message, and
+  the number of earlier readings;
 - `about`: text (JSON) with the format's version, the hand's identity, its calibration's text and the time of day at the start.
 
 An hour at the wire's highest rate, 119 readings a second, is 430,000 records of 4 kB: too much for memory. Records go to a

@@ -29,9 +29,9 @@ class ReplayOverError(TgdslError):
 class ReplaySource(HandSource):
     """A log that steps like `XHand1Source`, as one environment.
 
-    With a control step, a step delivers what the live source would have had: the newest reading that had arrived when the step
-    was over, or the first one within 80 ms after; else the failure of that time is raised again. Without one, each step
-    delivers the next reading or failure of the log, so that a log made of a source's own readings gives the very samples again.
+    With a control step, a step delivers the live source's reading: the newest one at the end of the step, or the first one
+    within 80 ms after; else it raises the failure of that time. Without one, each step delivers the next reading or failure of
+    the log, so that a log of a source's readings reproduces its samples.
     """
 
     NAME = "the log of an XHand1"
@@ -100,7 +100,7 @@ class ReplaySource(HandSource):
 
         Raises:
             ReplayOverError: If the log is at its end.
-            HandError: The failure that kept a reading from coming, as it was.
+            HandError: The recorded failure.
         """
         self._expect_more()
         if self._control_step is None:
@@ -129,7 +129,7 @@ class ReplaySource(HandSource):
         self._next_reading, self._next_fault = self.log.num_readings, len(self.log.faults)
 
     def _restart(self) -> None:
-        """Count steps from now, and deliver the first reading that was asked for from then on."""
+        """Count steps from now, and deliver the first reading requested from then on."""
         self._expect_more()
         if self._control_step is None:
             self._next_event()
