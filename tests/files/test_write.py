@@ -28,7 +28,7 @@ def test_permissions_are_those_of_a_new_file(tmp_path, touch, umask):
     (tmp_path / "scene.xml").write_text(ROBOT_XML)
     writers = {
         "a.safetensors": lambda path: tgdsl.save(touch, path),
-        "a.npz": lambda path: Recorder(touch, 1, 1).write(path, np.zeros((1, 4)), Path("scene.yaml")),
+        "a.npz": lambda path: Recorder(touch, 1, 1).write(path, np.zeros((1, 4)), Path("scene.yaml"), list("abcd")),
         "log.npz": lambda path: write_log(path, random_readings(np.arange(3.0))),
         "a.usda": lambda path: export_model(tmp_path / "scene.xml", path),
         "plain": lambda path: path.touch(),
