@@ -82,7 +82,7 @@ __all__ = sorted([*_PLACES, "testing"])  # pyright: ignore[reportUnsupportedDund
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used, so that no command waits for what it does not need."""
+    """Import a public name at its first use, so that commands start without unneeded imports."""
     if name == "__version__":
         return version("tgdsl")
     if name == "testing":

@@ -1,4 +1,4 @@
-"""What commands share: types of options, and what becomes of documents, robots, overrides, policies and outputs.
+"""Shared by commands: types of options, and the handling of documents, robots, overrides, policies and outputs.
 
 The help of an option without a value names its default, so none of these types prints `(default: None)`.
 """

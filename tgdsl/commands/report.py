@@ -1,4 +1,4 @@
-"""Commands about an installation: how fast and how exact it is, and what it has."""
+"""Commands about an installation: its speed, its accuracy and its parts."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def _run_tests(names: list[str], out: Path) -> None:
 
 
 def _run_sheet(name: str, tests: ModuleType, out: Path) -> int:
-    """Compute a report, print its table and write its files; return how many of its results are wrong."""
+    """Compute a report, print its table and write its files; return the number of wrong results."""
     from tgdsl.console.bar import Bar
 
     with Bar(name, 1, "section", bar_format=BAR_FORMAT) as bar:

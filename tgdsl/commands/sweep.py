@@ -71,7 +71,7 @@ class Sweep:
 
 
 def run_trial(trial: Trial, folder: str) -> str:
-    """Run a trial in this process, in which nothing else runs; go on where its folder holds a checkpoint; say how it ended.
+    """Run a trial in this process, alone; resume from a checkpoint in its folder; return its outcome as text.
 
     `trial.json` has its words, which identify its settings; `ended.json` is there once it is complete.
     """

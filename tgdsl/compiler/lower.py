@@ -237,10 +237,10 @@ def _proprioception(types: Collection[str], read: JointsRead, robot: RobotJoints
 
 
 def unfelt_taxels(resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: Pruned) -> tuple[Unfelt, ...]:
-    """Return the taxels with a sensor that cannot feel what it is to feel there.
+    """Return the taxels where some sensor cannot sense its objects.
 
-    A sensor that reads contacts cannot on a body that is never in contact with its objects. Where no object collides with a
-    body, nothing keeps the objects out of it, so that no taxel is too deep in it. Readings of bodies are not of taxels.
+    A sensor that reads contacts cannot on a body that is never in contact with its objects. If no object collides with a body,
+    objects can enter it, and no taxel is too deep in it. Readings of bodies do not count.
     """
     layout, within = resolved.layout, resolved.reach
     names = np.array([link.body for link in layout.links], dtype=object)[layout.link_id]
@@ -412,7 +412,7 @@ def _sensor(
 
 
 def _steps(sensor: LoweredSensor) -> int:
-    """Return how many calls, or samples of a block, are stacked in a sensor's reading; 0: none are."""
+    """Return the number of calls, or samples of a block, stacked in a sensor's reading; 0 if none."""
     history, lowered = sensor.spec.history, sensor.lowered
     if lowered.substeps:
         return lowered.substeps * max(lowered.samples, 1)

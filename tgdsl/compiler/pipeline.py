@@ -42,7 +42,7 @@ class Choice:
     notes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # lines of `explain`, by sensor with an `accuracy`
 
     def noted(self, plan: Plan) -> Plan:
-        """Return a Plan that says why its fields are what they are."""
+        """Return a Plan with notes on its chosen fields."""
         sensors = [
             dataclasses.replace(sensor, notes=(*sensor.notes, *self.notes.get(sensor.name, ()))) for sensor in plan.sensors
         ]

@@ -1,4 +1,4 @@
-"""From a Spec and a robot to a Layout: which links carry taxels, where these sit, and what they can feel."""
+"""From a Spec and a robot to a Layout: the links with taxels, the taxels' places, and the objects that they can sense."""
 
 from __future__ import annotations
 
@@ -191,7 +191,7 @@ class Resolved:
         return tuple(SurfaceGeom(geom, triangles(geom) if geom.shape == "mesh" else None) for geom in self.patches[link].geoms)
 
     def layout_on(self, sensor: str) -> tuple[np.ndarray, Layout]:
-        """Return the taxels of a sensor, and its layout; of one that is on links, no taxels and the links."""
+        """Return the taxels of a sensor, and its layout; for a sensor on links, no taxels and a layout of the links."""
         names = self.links[sensor]
         if sensor in self.on_links:
             joints = self.on_joints.get(sensor, ())
@@ -340,7 +340,7 @@ def _primitives(loaded: Loaded, scene: Model) -> tuple[Collider, ...]:
 
 
 def _is_foreign(loaded: Loaded, layout: LoadedLayout, robot: Model) -> bool:
-    """Return whether a layout is for another robot, which is then one mistake: none of its links is on this one."""
+    """Return whether a layout is for another robot, which is one mistake: this robot has none of its links."""
     keys = list(dict.fromkeys(key for placements in layout.spec.resolutions.values() for key in placements))
     if len(keys) < 2 or any(matched(robot, key) for key in keys):
         return False
@@ -375,7 +375,7 @@ def _sensor_links(
             selected = select(sensor.links, with_taxels, groups, report, elsewhere=link_names)
             links[name] = tuple(patches[i].link.name for i in selected)
             if missing:
-                # A name that the robot has but the layout does not is another mistake than a name nobody has.
+                # A name that only the layout lacks is another mistake than an unknown name.
                 unknown: list[Problem] = []
                 select(sensor.links, on_robot, groups, reporter(loaded, path, unknown), elsewhere=link_names)
                 problem = f'the layout puts no taxels on what this selects at resolution "{loaded.resolution}"'

@@ -72,7 +72,7 @@ def instrument(spec: mujoco.MjSpec, inputs: Inputs) -> mujoco.MjSpec:
 
 
 class ContactSensor(NamedTuple):
-    """A contact sensor: between parts of an object and of a link, what it shows, how it reduces, of how many contacts."""
+    """A contact sensor between parts of an object and of a link: its data, reduction and number of contacts."""
 
     name: str
     between: Touching
@@ -82,7 +82,7 @@ class ContactSensor(NamedTuple):
 
 
 def _contact_sensors(inputs: Inputs, spec: mujoco.MjSpec) -> Iterator[ContactSensor]:
-    """Yield the contact sensors that are wanted of a model."""
+    """Yield the contact sensors that a module needs in a model."""
     wants_slots, wants_net = inputs.slots > 0, "contact_netforce" in inputs.fields
     for pair in inputs.pairs:
         for i, between in enumerate(inputs.touching(pair)):

@@ -12,7 +12,7 @@ from pydantic_core import CoreSchema, core_schema
 from tgdsl.fields import units
 from tgdsl.fields.models import PATTERN
 
-DIMENSIONS = ("length", "force", "torque", "pressure", "temperature")  # dimensions of what sensors read
+DIMENSIONS = ("length", "force", "torque", "pressure", "temperature")  # dimensions of readings
 EXPECTED = 'a fraction such as "1 %", or an amount such as "0.02 mm"'
 _PERCENT = re.compile(r"\s*+([0-9]++\.?[0-9]*+|\.[0-9]++)([eE][-+]?[0-9]++)?\s*+%\s*+\Z")
 

@@ -115,7 +115,7 @@ def known_material(name: str) -> Material:
     """Return a material by its name.
 
     Raises:
-        ValueError: If there is none of that name.
+        ValueError: If there is no material of that name.
     """
     if name not in MATERIALS:
         raise ValueError(f'unknown material "{name}"; {did_you_mean(name, MATERIALS, "materials")}')

@@ -41,7 +41,7 @@ class Dimension:
     units: Mapping[str, float]  # factor to SI of each of its units; the first is tgdsl's internal unit, with a factor of 1
 
     def __post_init__(self) -> None:
-        """Raise `ValueError` if the first unit is not the one inside, or a unit cannot be written behind a number."""
+        """Raise `ValueError` if the first unit's factor is not 1, or a unit cannot be written after a number."""
         if not self.units or next(iter(self.units.values())) != 1.0:
             raise ValueError(f"the units of {self.name}: found {dict(self.units)}, expected one with the factor 1 first")
         for unit, factor in self.units.items():

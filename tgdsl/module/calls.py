@@ -18,11 +18,11 @@ from tgdsl.tensors import torch_internals
 Tensors = dict[str, Tensor]
 Step = Callable[..., Any]  # a bound method of a module that takes tensors and memory by name, and returns tensors by name
 Replay = Callable[[], Any]
-WARM_CALLS = 2  # calls before the one that is captured: they compile and load kernels
+WARM_CALLS = 2  # calls before the captured call: they compile and load kernels
 
 
 def captured(call: Callable[[], Tensors]) -> tuple[Replay, Tensors]:
-    """Capture a call as a CUDA graph; return what replays it, and the tensors that each replay writes."""
+    """Capture a call as a CUDA graph; return its replay function, and the tensors that each replay writes."""
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
@@ -76,7 +76,7 @@ class Graphed:
 
 
 class Calls:
-    """How a module's steps are to be called. A copy of a module compiles its own."""
+    """Compiled and graph-captured steps of a module. A copy of a module compiles its own."""
 
     def __init__(self) -> None:
         self._wanted: tuple[bool, dict[str, Any]] | None = None

@@ -37,10 +37,10 @@ _CLOCK_BYTES = 24  # three int64 of the clock for each environment, in addition 
 
 
 class OperationCounter(TorchDispatchMode):
-    """Counts what an eager run computes.
+    """Counts the operations of an eager run.
 
-    A matrix product takes its additions and multiplications, a Fourier transform of n numbers 2.5 n log2 n, the nearest of some
-    triangles what `geometry.bvh.query_operations` says; anything else one operation for each element that it writes.
+    A matrix product counts its additions and multiplications, a Fourier transform of n numbers 2.5 n log2 n, a search for the
+    nearest triangle `geometry.bvh.query_operations`; any other operation counts one for each element that it writes.
 
     Attributes:
         elements: Operations counted so far.
@@ -74,7 +74,7 @@ class OperationCounter(TorchDispatchMode):
 
 
 class Explained(NamedTuple):
-    """A module, as far as an account of it goes."""
+    """The parts of a module that its account describes."""
 
     plan: Plan
     quantities: tuple[Quantity, ...]
@@ -84,7 +84,7 @@ class Explained(NamedTuple):
 
 
 def operations_per_env(touch: Explained) -> int:
-    """Return how many elementary operations one environment takes, counted in an eager run: see `OperationCounter`."""
+    """Return the number of elementary operations per environment, counted in an eager run: see `OperationCounter`."""
     counts = []
     for num_envs in (2, 4):
         state = example_state(touch.plan.inputs, num_envs, 0, torch.float64, 0.03).to(touch.constants.device)
@@ -117,7 +117,7 @@ def explain(touch: Explained) -> str:
 
 
 def _asks(touch: Explained, sensor: PlannedSensor) -> list[str]:
-    """Return what a sensor asks of the scene, equal questions once."""
+    """Return a sensor's requests as text, equal ones once."""
     lines = []
     for requested in (each for each in touch.quantities if each.name in sensor.uses):
         use = sensor.uses[requested.name]
@@ -157,7 +157,7 @@ def _sensor(touch: Explained, sensor: PlannedSensor) -> list[str]:
 
 
 def _remembers(touch: Explained, sensor: PlannedSensor) -> str:
-    """Return what a sensor carries from one call to the next, and its size; the clock, which all share, is not in it."""
+    """Return the state of a sensor between calls, and its size, without the shared clock."""
     fixed, ring = _sizes(touch, sensor)
     names = [name if "/" not in name else " ".join(name.split("/")[:2]) for name in sensor.state]
     if sensor.windows:
@@ -173,7 +173,7 @@ def _remembers(touch: Explained, sensor: PlannedSensor) -> str:
 
 
 def _sizes(touch: Explained, sensor: PlannedSensor) -> tuple[int, int]:
-    """Return what a sensor remembers of each environment, and of each call of its delay in addition [bytes]."""
+    """Return the size of a sensor's state per environment, and additionally per call of its delay [bytes]."""
     size = torch.finfo(touch.constants.dtype).bits // 8
     fixed = size * sum(math.prod(memory.shape) for memory in sensor.state.values() if not memory.past)
     ring = size * sum(math.prod(memory.shape) for memory in sensor.state.values() if memory.past)

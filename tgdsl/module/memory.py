@@ -1,6 +1,6 @@
-"""What a module carries from one call to the next: buffers of each sensor, windows over last readings, and its clock.
+"""A module's state between calls: buffers of each sensor, windows over the last readings, and the clock.
 
-Shapes: `env` environments, `call` calls that a ring remembers, `step` calls of a window, oldest first, `row` taxels or bodies,
+Shapes: `env` environments, `call` calls in a ring, `step` calls in a window, oldest first, `row` taxels or bodies,
 `channel` numbers per row.
 """
 
@@ -29,13 +29,13 @@ from tgdsl.tensors.torch_internals import HookedModule, held_buffers, num_writes
 Tensors = dict[str, Tensor]
 Window = Float[Tensor, "env step channel row"]
 WINDOW, KEPT = "history/", "kept/"  # buffers `history/<reading>`, a window; `kept/<reading>`, the last reading
-SHARED = ("clock/seed", "clock/first_env", "clock/periods", "clock/keys")  # what all environments have in common
-EVERY = 16  # on a GPU one call in so many is checked: a small kernel takes as long to launch as a module's own
+SHARED = ("clock/seed", "clock/first_env", "clock/periods", "clock/keys")  # buffers that all environments share
+EVERY = 16  # on a GPU one call in so many is checked: a small kernel takes as long to launch as a module's
 _INT64 = 2**63
 
 
 class Clock(HookedModule):
-    """Counts calls and episodes of each environment. It holds nothing until `start`, nor if no sensor asks for it.
+    """Counts calls and episodes of each environment. It has no buffers before `start`, or if no sensor needs it.
 
     Buffers, all int64: `seed`, `first_env` (number of the first environment, counted over all processes); per environment,
     (env,): `step` (calls so far), `episode` (resets), `age` (calls since the last reset). In the module's dtype: `ages`
@@ -110,7 +110,7 @@ class Clock(HookedModule):
         return {f"clock/{name}": buffer for name, buffer in held_buffers(self).items()}
 
     def nows(self, memory: Mapping[str, Tensor], dt: Tensor | None) -> dict[str, Now]:
-        """Return when each sensor that reads the clock is called, by its name; `dt`: time since the last call [s].
+        """Return the time of the call for each sensor that reads the clock, by name; `dt`: time since the last call [s].
 
         `memory` has the clock's tensors, and for each sensor with a rate `<sensor>:sample/phase` (env,), the time since its
         last sample was due [s].
@@ -133,7 +133,7 @@ class Clock(HookedModule):
         return nows
 
     def context(self, sensor: PlannedSensor, memory: Mapping[str, Tensor], dt: Tensor | None, substep: int = 0) -> Context:
-        """Return when a sensor's kind is called at one of its substeps; nothing of it if the kind does not read it."""
+        """Return the time of a call of a sensor's kind at one of its substeps; untimed if the kind does not read it."""
         if not sensor.is_timed:
             return UNTIMED
         assert dt is not None
@@ -159,7 +159,7 @@ class Clock(HookedModule):
         return counts
 
     def _restart(self) -> None:
-        """Write the seed and what follows from it, and start all counts from 0, in place: captured graphs go on with them."""
+        """Write the seed and its keys, and reset all counts to 0, in place: captured graphs refer to these buffers."""
         assert self.num_envs is not None
         distributed = torch.distributed
         rank = distributed.get_rank() if distributed.is_available() and distributed.is_initialized() else 0
@@ -255,9 +255,9 @@ class Memory(HookedModule):
         self._kept = {name: (*shape[:-2], shape[-1], shape[-2]) for name, shape in shapes.items()}
         self._views = [reading.name for history, reading in windows if history.view]
         self._last: dict[str, tuple[Tensor, int]] = {}
-        self._is_filled = False  # whether the stored readings were handed out
-        # Whether the last readings are stored from the first call on, and not only once some environments are read alone, which
-        # needs them: code that is compiled for the first call then serves all later ones.
+        self._is_filled = False  # whether the stored readings have been returned
+        # Whether the last readings are stored from the first call on, not only once a masked call needs them: code compiled for
+        # the first call then serves all later calls.
         self.keeps_last = False
         self.clock = Clock(sensors)
         self.home = torch.empty(0)  # has device and dtype of state that is loaded before the first call
@@ -390,7 +390,7 @@ class Memory(HookedModule):
         if loaded or age is not None:
             errors.extend(self._misfits(loaded, age, prefix))
         if errors:
-            return  # nothing is loaded, nor by the clock
+            return  # nothing is loaded, in the clock neither
         with torch.inference_mode(False):
             for path, value in loaded.items():
                 if path not in (held := held_buffers(self)) or held[path].shape != value.shape:

@@ -229,7 +229,7 @@ class TactileModule(HookedModule):
         source: str = "",
         overrides: Sequence[str] = (),
     ) -> Signature:
-        """Write `step` and `observe` as a file that runs without tgdsl: see docs/how-to/export.md. The module stays as it is.
+        """Write `step` and `observe` as a file that runs without tgdsl: see docs/how-to/export.md. The module is not changed.
 
         The file has the module's constants, dtype, device and seed, and takes any number of environments.
 
@@ -297,7 +297,7 @@ class TactileModule(HookedModule):
         return readings
 
     def look(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return the readings of `core`, and leave the state as it is."""
+        """Return the readings of `core` without changing the state."""
         return self.core(tensors, memory)[0]
 
     def core(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:

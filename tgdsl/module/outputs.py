@@ -88,7 +88,7 @@ def observe(
 
     Raises:
         ObservationError: If a reading that is observed is missing or of another shape, if readings are of different numbers of
-            environments, or an observation is one that only the real hand has.
+            environments, or an observation exists on the real hand only.
     """
     if not isinstance(readings, Mapping):
         raise ObservationError(

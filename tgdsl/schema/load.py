@@ -89,7 +89,7 @@ class Loaded(Section):
 
     @property
     def resolution(self) -> str | None:
-        """The resolution that is compiled: the one named, or the only one."""
+        """The resolution to compile: the document's, or the layout's only one."""
         if self.spec.resolution is not None or self.layout is None:
             return self.spec.resolution
         names = list(self.layout.spec.resolutions)
@@ -212,7 +212,7 @@ def parse_spec(content: bytes | Mapping[str, Any], name: str, model: type[S], re
 
 
 def load_layout(path: FilePath) -> LoadedLayout:
-    """Read a layout file by itself.
+    """Read a layout file.
 
     Raises:
         SpecError: All its mistakes.

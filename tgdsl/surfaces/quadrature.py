@@ -34,7 +34,7 @@ Distance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True, eq=False)
 class Quadrature:
-    """Points that stand for a surface."""
+    """Points that represent a surface."""
 
     pos: Float[np.ndarray, "n 3"]  # places in the body's frame [m]
     area: Float[np.ndarray, " n"]  # surface that each stands for [m²]

@@ -100,7 +100,7 @@ def choose(
 
 
 def _is_asked(document: Document, overrides: Mapping[str, Any] | None) -> bool:
-    """Return whether a document may have an `accuracy`, without reading it twice; one that cannot be read has none."""
+    """Return whether a document may have an `accuracy`, without parsing it; an unreadable document has none."""
     if any("accuracy" in path or _names_accuracy(value) for path, value in (overrides or {}).items()):
         return True
     if isinstance(document, (str, PathLike)):
@@ -166,7 +166,7 @@ class Found(NamedTuple):
 
 
 def _measured_choice(task: Task) -> Choice:
-    """Measure and choose: for each sensor by itself, then with objects as fine as the strictest sensor needs."""
+    """Measure and choose: for each sensor alone, then with objects as fine as the strictest sensor needs."""
     recording, floors = _states(task), _floors(task.loaded, task.wanted)
 
     def by_itself(name: str) -> Found:
@@ -250,7 +250,7 @@ def account(trial: Trial, own: Outcome, shared: Shared) -> tuple[str, ...]:
 
 
 def _reasons(sensor: str, shared: Shared) -> dict[str, str]:
-    """Return why objects are finer than a sensor by itself would have them."""
+    """Return why objects have finer queries than a sensor alone needs."""
     result = {}
     for target, place in shared.alone[sensor].items():
         tied = [name for name, places in shared.alone.items() if places.get(target) == shared.places[target]]

@@ -31,7 +31,7 @@ from tgdsl.scene.scene import scene_model
 LEAST_ENVS = 2  # half of the environments choose, the others verify
 SWAY, PERIODS = 0.03, (0.05, 0.4)
 """Amplitude of the motion added to the controls, as a fraction of their range, and its periods, as fractions of a run."""
-REACH = (0.5, 1.1)  # how far each environment's controls go from their start, of the script's own
+REACH = (0.5, 1.1)  # range of each environment's control amplitude, over the script's
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def load_recording(path: Path) -> Recording:
     """Read states that `save_recording` wrote.
 
     Raises:
-        StateError: If the file cannot be read, is none of states, or holds too few.
+        StateError: If the file cannot be read, is not a file of states, or holds too few.
     """
     arrays = read_arrays(path, "an .npz file of states", StateError)
     fields = [name for name in SHAPES if name in arrays]

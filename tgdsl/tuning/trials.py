@@ -1,4 +1,4 @@
-"""A sensor's variants, compiled from its document with one thing changed: what each costs, and how far each is off.
+"""A sensor's variants, compiled from its document with one change each: their costs and errors.
 
 Shapes: `step` calls, `env` environments, `row` rows of a reading, `channel` numbers per row.
 """

@@ -28,7 +28,7 @@ class Interval(NamedTuple):
 
 
 class Magnitude(NamedTuple):
-    """What errors of a reading are relative to."""
+    """Magnitude of a reading, to which its errors are relative."""
 
     rest: Float[np.ndarray, " channel"]  # median of each channel
     # largest difference of a channel from its median, or of one of the same quantity (`force` of `force_x`); 1 where nothing
@@ -60,7 +60,7 @@ def halves(num_envs: int) -> tuple[slice, slice]:
 
 
 def magnitude_of(expected: Readings, quantities: Sequence[str]) -> Magnitude:
-    """Return what errors of a reading are relative to; `quantities` names what each channel is a component of."""
+    """Return the magnitude to which a reading's errors are relative; `quantities` names each channel's quantity."""
     rest = np.median(expected.reshape(-1, expected.shape[-1]), axis=0)
     away = np.abs(expected - rest)
     largest = away.max(axis=(0, 1, 2), initial=0.0)
@@ -72,7 +72,7 @@ def magnitude_of(expected: Readings, quantities: Sequence[str]) -> Magnitude:
 def errors_of(found: Readings, expected: Readings, magnitude: Magnitude, is_relative: bool = True, seed: int = 0) -> Errors:
     """Return the errors of readings, each relative to its channel's magnitude.
 
-    Intervals are a bootstrap's over environments, whose states depend on each other in time but not among themselves.
+    Intervals are a bootstrap over environments, whose states are correlated in time but independent of each other.
     """
     is_finite = bool(np.isfinite(found).all())
     error = np.abs(found - expected) / (magnitude.scale if is_relative else 1.0)

@@ -1,4 +1,4 @@
-"""A plan's sensor by its kind's float64 reference, and how far readings are from it, at ties from the nearer side.
+"""A plan's sensor by its kind's float64 reference, and the distance of readings from it, at ties from the nearer side.
 
 Shapes: `env` environments, `row` rows of a reading, `channel` numbers per row.
 """

@@ -85,18 +85,18 @@ def readings_of(touch: TactileModule, states: Sequence[SceneState], name: str) -
 
 
 class Common(NamedTuple):
-    """What two modules' readings of a sensor have in common: readings at the same places, samples at the same times."""
+    """The shared part of two modules' readings of a sensor: readings at the same places, samples at the same times."""
 
-    here: Int[np.ndarray, " row"] | None  # rows of the one's reading that the other has too; None: all
-    there: Sequence[Int[np.ndarray, " row"]] | None  # rows of the other's whose mean is at each of these; None: the same
-    channels: Int[np.ndarray, " channel"] | None  # channel of the other for each; -1: none, read as 0; None: the same
+    here: Int[np.ndarray, " row"] | None  # rows of the first module's reading that the second has too; None: all
+    there: Sequence[Int[np.ndarray, " row"]] | None  # per row, rows of the second reading to average; None: the same
+    channels: Int[np.ndarray, " channel"] | None  # per channel, the second's channel; -1: none, read as 0; None: the same
 
     def of_one(self, readings: Shaped[np.ndarray, "step env row channel"]) -> np.ndarray:
-        """Return the one's reading where there is one of the other's too."""
+        """Return the first module's reading in the shared rows."""
         return readings if self.here is None else readings[:, :, self.here]
 
     def of_other(self, readings: Float[np.ndarray, "step env row channel"]) -> np.ndarray:
-        """Return the other's reading there, in the one's channels."""
+        """Return the second module's reading in the shared rows, in the first's channels."""
         if self.there is not None:
             readings = np.stack([readings[:, :, at].mean(axis=2) for at in self.there], axis=2)
         if self.channels is not None:
@@ -105,7 +105,7 @@ class Common(NamedTuple):
 
 
 def common_of(own: TactileModule, other: TactileModule, name: str) -> Common:
-    """Return what another module's reading has in common with a module's.
+    """Return the shared part of two modules' readings of a sensor.
 
     A row is compared with the nearest row on the same link, or with the mean of equally near rows. A block's last sample is at
     its end; samples are compared at times that both blocks have. Channels are matched by name.
@@ -129,7 +129,7 @@ def common_of(own: TactileModule, other: TactileModule, name: str) -> Common:
 
 
 def _rows_at(own: TactileModule, other: TactileModule, name: str) -> list[Int[np.ndarray, " row"]] | None:
-    """Return which rows of another module's reading are where each row of a module's is; None: they are the same rows."""
+    """Return, for each row of a module's reading, the rows of another's at its place; None: they are the same rows."""
     here, there = (touch.rows.get(name) for touch in (own, other))
     if here is None or there is None or (len(here) == len(there) and (here == there).all()):
         return None

@@ -1,4 +1,4 @@
-"""The variants of a sensor that trade speed for error: what its kind says of its fields, and how its meshes are queried."""
+"""The variants of a sensor that trade speed for error: alternatives of its fields, from its kind, and of its mesh queries."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def is_free(spec: Any, alternative: Alternative) -> bool:
 
 
 def written_of(spec: Any, alternatives: Sequence[Alternative]) -> list[str]:
-    """Return the fields of a spec that somebody wrote and some alternative would change."""
+    """Return the fields of a spec that are set and that some alternative would change."""
     changed = {key for alternative in alternatives for key in (*alternative.changes, *alternative.unused)}
     return sorted(key for key in spec.model_fields_set & changed if getattr(spec, key) is not None)
 

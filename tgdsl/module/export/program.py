@@ -223,7 +223,7 @@ def write_onnx(
 
 
 def _traced(flat: FlatStep, plan: Plan) -> torch.export.ExportedProgram:
-    """Return the step as a graph; operations that are none of torch's own are errors."""
+    """Return the step as a graph; operations that are not torch's are errors."""
     example = flat.example
     env = torch.export.Dim.DYNAMIC
     with torch.no_grad():

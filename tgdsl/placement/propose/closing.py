@@ -65,7 +65,7 @@ class Poses:
                 start[at] = np.clip(start[at], *tree.model.jnt_range[joint])
         settled = self._bound(start, self.dofs)
         if settled is None:
-            self.equalities = []  # they do not hold at the start: each joint by itself says more
+            self.equalities = []  # they do not hold at the start: independent joints are the better guess
         self.start = start if settled is None else settled
 
     def at(self, joint: int) -> int:
@@ -98,7 +98,7 @@ class Poses:
 
     @cached_property
     def independent(self) -> list[int]:
-        """Joints that can be set each by itself: with limits before without, driven before not, near to the base before far."""
+        """Joints that can be set independently: limited before unlimited, driven before free, near the base before far."""
         if not self.equalities:
             return list(self.joints)
         self.data.qpos[:] = self.start
@@ -206,12 +206,12 @@ _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 
 @dataclass(frozen=True)
 class Motion:
-    """How a joint that can be set by itself closes a hand."""
+    """The motion of an independent joint that closes a hand."""
 
     opened: float  # its value when open [rad, of slides m]
     closed: float  # its value when closed
     is_curling: bool  # whether it bends a finger of several joints
-    doubt: str = ""  # what speaks against it; empty if nothing does
+    doubt: str = ""  # evidence against it; empty if there is none
 
 
 class Closing:
@@ -219,7 +219,7 @@ class Closing:
 
     Attributes:
         poses: The hand's poses.
-        motions: How each joint closes; one that is not clear is not in it.
+        motions: The closing motion of each joint; unclear joints are left out.
         rotations: Per joint, the hinges that turn as it moves to the high end, and the axes of these rotations in the world.
     """
 

@@ -326,7 +326,7 @@ def _gripper_of(tree: KinematicTree, segment: int) -> Hand | None:
 
 
 def _ahead(tree: KinematicTree, joint: int, parent: int, value: float) -> dict[int, float]:
-    """Return how far bodies of a jaw and of its parent reach beyond the hinge in the jaw's direction [m]."""
+    """Return the reach of a jaw's and its parent's bodies beyond the hinge in the jaw's direction [m]."""
     data, segment = mujoco.MjData(tree.model), tree.segment[int(tree.model.jnt_bodyid[joint])]
     data.qpos[:] = tree.model.qpos0
     data.qpos[tree.model.jnt_qposadr[joint]] = value
@@ -364,7 +364,7 @@ def _parts_within(tree: KinematicTree, base: int, other: int) -> bool:
 
 
 def length_of(tree: KinematicTree, segment: int) -> float:
-    """Return the length from where a segment moves against its parent to the end of what it carries [m]."""
+    """Return the length from a segment's joint to the far end of the bodies that it carries [m]."""
     distances = [float(np.linalg.norm(tree.centre(b, tree.start) - anchor(tree, segment))) for b in tree.bodies[segment]]
     reach = [distance + 0.5 * tree.area[b] ** 0.5 for distance, b in zip(distances, tree.bodies[segment], strict=True)]
     for child in tree.children(segment):
@@ -398,7 +398,7 @@ def _hand(tree: KinematicTree, base: int, segments: Sequence[int] | None = None)
 
 
 def _mounts(tree: KinematicTree, base: int) -> list[int]:
-    """Return the bodies with surface of a segment that are not before the one that carries its chains."""
+    """Return the bodies of a segment with surface, without the ones before the body that carries its chains."""
     above = [tree.within(base, int(tree.model.body_parentid[child])) for child in tree.children(base)]
     if len(above) < 2:
         return tree.bodies[base]

@@ -1,6 +1,6 @@
-"""A first layout for a robot that nobody has described: groups and taxels guessed from its tree, joints and surfaces.
+"""A first layout for a robot without one: groups and taxels guessed from its tree, joints and surfaces.
 
-Every guess is written down in the file, for its reader to keep or to change. A `Draft` changes it before it is written.
+Every guess is written to the file, where a reader can change it. A `Draft` changes it before it is written.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Proposal:
     links: tuple[LinkProposal, ...]  # links with taxels, in the robot's body order
     left_out: tuple[tuple[str, str], ...]  # bodies without taxels, and why
     shared: tuple[str, ...]  # names of links that other links' geoms or meshes have too
-    is_collided: bool  # whether the simulator collides its links; else none of them
+    is_collided: bool  # whether the simulator collides its links: all or none
     is_misread: bool = False  # whether limits of its hinges look like radians that were read as degrees
     chosen_groups: frozenset[str] = frozenset()  # groups whose links are chosen, not guessed
 

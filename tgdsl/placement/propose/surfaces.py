@@ -33,7 +33,7 @@ Options = Mapping[str, str | bool]  # options of a placement, `surface` and `exp
 
 @dataclass(frozen=True, eq=False)
 class LinkSurface:
-    """Samples of what can be touched of a body, in its frame."""
+    """Samples of a body's touchable surface, in its frame."""
 
     pool: Pool  # points on it
     options: Options = field(default_factory=dict)  # options of a placement that samples it
@@ -95,7 +95,7 @@ class Sampler:
         self.left_out.append((name, why))
 
     def sampled(self, name: str, radius: float) -> LinkSurface | str:
-        """Return what taxels of a radius [m] can touch of a link, or why they can touch nothing."""
+        """Return the surface of a link that taxels of a radius [m] can touch, or the reason why there is none."""
         try:
             pool = self._pool(name, as_collided=False)
         except (RobotError, SampleError) as error:

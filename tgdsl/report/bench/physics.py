@@ -1,4 +1,4 @@
-"""The physics under other options: how far objects and joints end up from where a fine run has them, and what a step takes.
+"""The physics under other options: errors of joints and objects against a fine run, and the time of a step.
 
 Shapes: `step` control steps, `env` environments, `actuator` actuators, `coordinate` joint angles and positions.
 """
@@ -24,7 +24,7 @@ from tgdsl.sensors.known import known_kinds
 from tgdsl.tuning.recording import control_ranges, varied
 from tgdsl.tuning.trials import Cost
 
-FINE = 4  # how many times smaller the time step of the fine run is
+FINE = 4  # the document's time step over the fine run's
 ITERATIONS, TOLERANCE = 400, 1e-12  # of the solver in the fine run
 
 
