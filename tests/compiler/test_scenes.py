@@ -114,7 +114,7 @@ def test_one_geom_instead_of_the_scenes(tmp_path):
 @pytest.mark.parametrize(
     ("target", "message"),
     [
-        ({}, "expected `body`, the name of a body in the scene, or `geom` or `variants` for a body of its own"),
+        ({}, "expected `body`, the name of a body in the scene, or `geom` or `variants` for an added body"),
         ({"geom": BALL, "variants": [BALL]}, "found `geom` and `variants`, expected one of them"),
         ({"body": "pad", "pos": [0, 0, 1]}, '`pos` is for an added body; the scene sets it for body "pad"'),
         ({"geom": {"type": "plane", "size": [1]}}, "objects.item.geom.type: found \"plane\", expected 'sphere'"),
