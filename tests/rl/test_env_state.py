@@ -52,7 +52,7 @@ def test_what_is_read_is_there_again_after_a_loaded_states_next_step(make):
     saved = env.state_dict()
     env.load_state_dict(saved)
     for told in (lambda: env.now, env.images):
-        with pytest.raises(SimulationError, match="a state was loaded: what was read then is there again after the next step"):
+        with pytest.raises(SimulationError, match="a state was loaded: its readings are available after the next step"):
             told()
     env.step(torch.zeros(4, 2))
     assert env.now.object.pos.shape == (4, 3)

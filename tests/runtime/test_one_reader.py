@@ -17,8 +17,8 @@ PRESSED = SCENE.replace('pos="0 0 .0299"', 'pos="0 0 .028"')
 BIT = {"kind": "contact", "threshold": 1e-3, "release_threshold": 5e-4}
 BOTH = pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
 TAKEN = (
-    r"^this module is read by a simulation of 2 environments, whose state it holds; `close` that one, or give this one a module of "
-    r"its own: tgdsl\.compile\(\.\.\.\) again, or copy\.deepcopy\(touch\)$"
+    r"^this module is read by a simulation of 2 environments, whose state it holds; `close` that one, or give this one "
+    r"another module: tgdsl\.compile\(\.\.\.\) again, or copy\.deepcopy\(touch\)$"
 )
 
 
