@@ -140,7 +140,7 @@ def test_the_command(monkeypatch, capsys):
         COMPILERS,
         {"egl": True},
         {"/nowhere": None},
-        told_of(sound),
+        located_warnings(sound),
     )
     monkeypatch.setattr(doctor, "examine", lambda: broken)
     with pytest.raises(SystemExit) as stopped:
@@ -153,5 +153,5 @@ def test_the_command(monkeypatch, capsys):
     assert "missing: no OpenGL by MUJOCO_GL=glfw: `tgdsl play --video` is refused: set MUJOCO_GL=egl\n" in printed
 
 
-def told_of(sound):
+def located_warnings(sound):
     return findings((Package("numpy", "1.0", ">=2.0", ""),), COMPILERS, sound.devices, {"glfw": False, "egl": True})

@@ -13,7 +13,7 @@ from oracles.setups.scenes import pad
 
 import tgdsl
 from tgdsl.formats.robot import load_model
-from tgdsl.scene.mujoco_warnings import StepWarnings, told_of
+from tgdsl.scene.mujoco_warnings import StepWarnings, located_warnings
 
 REPOSITORY = Path(__file__).parents[2]
 INERTIAL = "<inertial><mass value='.1'/><inertia ixx='1e-5' iyy='1e-5' izz='1e-5' ixy='0' ixz='0' iyz='0'/></inertial>"
@@ -55,7 +55,7 @@ def test_a_handler_of_the_user_s_is_given_back():
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(own)
     try:
-        with pytest.raises(ValueError, match="broken"), told_of("x"):
+        with pytest.raises(ValueError, match="broken"), located_warnings("x"):
             raise ValueError("broken")
         assert mujoco.get_mju_user_warning() is own
     finally:
@@ -65,7 +65,7 @@ def test_a_handler_of_the_user_s_is_given_back():
 def test_others_keep_their_words_and_kind():
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        with told_of("hand.xml"):
+        with located_warnings("hand.xml"):
             warnings.warn("old", DeprecationWarning, stacklevel=1)
             warnings.warn("hand.xml: a reader's own", stacklevel=1)
             warnings.warn("Attaching a spec with an empty prefix", stacklevel=1)
@@ -90,10 +90,10 @@ def test_a_step_s_are_told_once_each_whatever_their_numbers():
     told = StepWarnings()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        told.tell(
+        told.warn(
             ["Pre-allocated constraint buffer is full (12). Time = 0.1000.\n\n", "Nan, Inf or huge value in QACC at DOF 0."]
         )
-        told.tell(["Pre-allocated constraint buffer is full (13). Time = 0.2000.\n\n", "Another thing. Time = 1e-3."])
+        told.warn(["Pre-allocated constraint buffer is full (13). Time = 0.2000.\n\n", "Another thing. Time = 1e-3."])
     assert [str(w.message) for w in caught] == [
         "MuJoCo: Pre-allocated constraint buffer is full (12). Time = 0.1000.; shown once",
         "MuJoCo: Another thing. Time = 1e-3.; shown once",

@@ -19,7 +19,7 @@ from tgdsl.plan.scene import Asset, Collider, SceneFile, SceneGeom, SceneObject
 from tgdsl.quantities.bake import aligned
 from tgdsl.scene.asset_paths import ENDINGS, FOLDER_ATTRIBUTES
 from tgdsl.scene.compare import differing_fields
-from tgdsl.scene.mujoco_warnings import muted_mujoco, told_of
+from tgdsl.scene.mujoco_warnings import located_warnings, muted_mujoco
 from tgdsl.scene.scene import Choice, compiled, geom_name, placeholder_name, portable, readable, with_choices
 from tgdsl.schema.objects import MeshGeom, ObjectSpec, PrimitiveGeom
 
@@ -369,7 +369,7 @@ def _scene_geom(geom: PrimitiveGeom | MeshGeom, folder: Path, meshes: Files, rep
     trial.assets = {key: readable(key, meshes.contents[key])}
     trial.add_mesh(name=path.stem, file=key)
     try:
-        with told_of(path):
+        with located_warnings(path):
             trial.compile()
     except ValueError as error:
         report(f'MuJoCo cannot read mesh file "{geom.mesh}": {" ".join(str(error).split()).replace(key, path.name)}')

@@ -12,7 +12,7 @@ from tgdsl.errors import RobotError, listed
 from tgdsl.formats.mjcf import read_mjcf
 from tgdsl.formats.model import Model
 from tgdsl.formats.urdf import read_urdf
-from tgdsl.scene.mujoco_warnings import told_of
+from tgdsl.scene.mujoco_warnings import located_warnings
 
 Reader = Callable[[Path], Model]
 """Reads and compiles a file; `load_model` names the file in what it raises that is MuJoCo's or the system's."""
@@ -52,7 +52,7 @@ def load_model(path: Path) -> Model:
         RobotError: If it cannot be read or compiled, with MuJoCo's own account of the element at fault, or the prim's path.
     """
     try:
-        with told_of(path):
+        with located_warnings(path):
             suffix, root = path.suffix.lower(), "" if path.suffix.lower() in READERS else _root_element(path)
             if not root and suffix not in (*READERS, *MJCF) and path.is_file():
                 raise RobotError(f"{path}: this is no robot or scene file, expected MJCF, URDF or USD")

@@ -38,7 +38,7 @@ def muted_mujoco() -> Iterator[None]:
 
 
 @contextmanager
-def told_of(file: object, stacklevel: int = 4) -> Iterator[None]:
+def located_warnings(file: object, stacklevel: int = 4) -> Iterator[None]:
     """Repeat each different warning of MuJoCo's model reader once at the end; if reading fails, there is only the error.
 
     Args:
@@ -65,7 +65,7 @@ class StepWarnings:
     def __init__(self) -> None:
         self._told: set[str] = set()
 
-    def tell(self, messages: Sequence[str]) -> None:
+    def warn(self, messages: Sequence[str]) -> None:
         """Warn of new kinds of messages."""
         for message in messages:
             kind = re.sub(r"\d[\d.e+-]*", "", message)  # without time and element numbers

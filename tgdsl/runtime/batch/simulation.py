@@ -416,4 +416,4 @@ class BatchSimulation(Simulation):
         except (mujoco.batch.SimulationError, mujoco.FatalError, ValueError) as error:
             raise SimulationError(f"MuJoCo: {error}") from error
         if messages:
-            self._warnings.tell(messages)
+            self._warnings.warn(messages)
