@@ -117,7 +117,7 @@ def test_rollouts(three, tmp_path):
         recorder = Recorder(module, len(controls), 1)
         for step in rollout(module, sim, controls):
             recorder.add(step)
-        recorder.write(tmp_path / f"{name}.npz", controls, Path("scene.yaml"))
+        recorder.write(tmp_path / f"{name}.npz", controls, Path("scene.yaml"), ["a", "b"])
     tgdsl.check_taxels(touch, tmp_path / "same.npz")
     with pytest.raises(TaxelError) as caught:
         tgdsl.check_taxels(touch, tmp_path / "other.npz")
