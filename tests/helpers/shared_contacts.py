@@ -5,6 +5,8 @@ import dataclasses
 import numpy as np
 import torch
 
+from tgdsl.geometry import planes
+from tgdsl.quantities.contacts import ContactPoints
 from tgdsl.sensors.force_taxel.footprint import LEVENBERG, Bodies, box, place
 
 RADIUS = 0.01
@@ -101,8 +103,8 @@ def cases():
 def arguments(case, dtype):
     """Return the arguments of `shared_forces` in a dtype."""
     bodies, _, depth, *rest = case
-    vectors = [tuple(torch.tensor(value, dtype=dtype) for value in part) for part in rest[:4]]
-    net = tuple(part.sum(dim=-1) for part in vectors[1])
+    vectors = [planes.vec(torch.tensor(value, dtype=dtype) for value in part) for part in rest[:4]]
+    contacts = ContactPoints(*vectors, net=planes.vec(part.sum(dim=-1) for part in vectors[1]))
     radius, levenberg = (torch.tensor(value, dtype=dtype) for value in rest[4:])
     floats = {name: value.to(dtype) for name, value in vars(bodies).items() if value.is_floating_point()}
-    return dataclasses.replace(bodies, **floats), torch.tensor(depth, dtype=dtype), *vectors, net, radius, levenberg
+    return dataclasses.replace(bodies, **floats), torch.tensor(depth, dtype=dtype), contacts, radius, levenberg

@@ -53,10 +53,13 @@ def load_model(path: Path) -> Model:
     """
     try:
         with located_warnings(path):
-            suffix, root = path.suffix.lower(), "" if path.suffix.lower() in READERS else _root_element(path)
-            if not root and suffix not in (*READERS, *MJCF) and path.is_file():
+            suffix = path.suffix.lower()
+            if suffix in READERS:
+                return READERS[suffix](path)
+            root = _root_element(path)
+            if not root and suffix not in MJCF and path.is_file():
                 raise RobotError(f"{path}: this is no robot or scene file, expected MJCF, URDF or USD")
-            return (READERS.get(suffix) or ROOTS.get(root, read_mjcf))(path)
+            return ROOTS.get(root, read_mjcf)(path)
     except (ValueError, OSError, mujoco.FatalError) as error:
         raise RobotError(f"{path}: {' '.join(str(error).split())}") from error
 

@@ -44,6 +44,7 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
+from tgdsl.quantities.contacts import ContactPoints
 from tgdsl.sensors.base import Array
 from tgdsl.sensors.force_taxel.constants import damping, no_force, unreached, wholly
 from tgdsl.tensors.operations import Operation
@@ -144,11 +145,7 @@ class Shared(NamedTuple):
 def shared_forces(
     bodies: Bodies[Tensor],
     depth: Float[Tensor, "env taxel"],
-    point: Vec,
-    force: Vec,
-    torque: Vec,
-    normal: Vec,
-    net: Vec,
+    contacts: ContactPoints,
     radius: Float[Tensor, " body"],
     levenberg: Float[Tensor, " iteration"],
 ) -> Shared:
@@ -157,11 +154,7 @@ def shared_forces(
     Args:
         bodies: Which taxels each body has.
         depth: Depth of each probe [m].
-        point: Contact points [m], planes (env, body, contact).
-        force: Forces on the body [N].
-        torque: Torques on the body at the contact points [N·m].
-        normal: Unit normals out of the objects.
-        net: Net forces on the bodies, planes (env, body) [N].
+        contacts: Contacts on each body.
         radius: Radius of a footprint r_f [m].
         levenberg: Least curvature of each step towards the moment [1]; of length 0 it leaves λ⁰.
     """
@@ -173,51 +166,33 @@ def shared_forces(
         inverse_radius > 0,
         depths * inverse_radius,
         planes.vec(bodies.padded[3:]),
-        point,
-        force,
-        torque,
-        normal,
+        contacts.pos,
+        contacts.force,
+        contacts.torque,
+        contacts.normal,
         radius,
         levenberg,
     )
-    padded = [(share * part[..., None]).sum(dim=2) for part in force]
+    padded = [(share * part[..., None]).sum(dim=2) for part in contacts.force]
     result = torch.stack([part.flatten(1).index_select(1, bodies.row) for part in padded], dim=1)
-    missed = torch.stack(net, dim=1) - torch.stack([part.sum(dim=2) for part in padded], dim=1)
+    missed = torch.stack(contacts.net, dim=1) - torch.stack([part.sum(dim=2) for part in padded], dim=1)
     return Shared(result, missed, torch.stack(residual, dim=1))
 
 
 def _shared_by_kernel(
-    bodies: Bodies[Tensor],
-    depth: Tensor,
-    point: Vec,
-    force: Vec,
-    torque: Vec,
-    normal: Vec,
-    net: Vec,
-    radius: Tensor,
-    levenberg: Tensor,
+    bodies: Bodies[Tensor], depth: Tensor, contacts: ContactPoints, radius: Tensor, levenberg: Tensor
 ) -> Shared:
     from tgdsl.sensors.force_taxel import footprint_kernel
 
     inverse_radius = bodies.inverse_radius.flatten()[bodies.row]
     weight = torch.log2(depth * inverse_radius + unreached())
     args = radius, levenberg, bodies.first, bodies.box
-    shared, sums = footprint_kernel.shared_forces(bodies.place, weight, point, force, torque, normal, net, *args)
+    shared, sums = footprint_kernel.shared_forces(bodies.place, weight, *contacts, *args)
     return Shared(shared, sums[:, :3], sums[:, 3:])
 
 
-def _inputs(
-    bodies: Bodies[Tensor],
-    depth: Tensor,
-    point: Vec,
-    force: Vec,
-    torque: Vec,
-    normal: Vec,
-    net: Vec,
-    radius: Tensor,
-    levenberg: Tensor,
-) -> list[Tensor]:
-    return [depth, *point, *force, *torque, *normal, *net]
+def _inputs(bodies: Bodies[Tensor], depth: Tensor, contacts: ContactPoints, radius: Tensor, levenberg: Tensor) -> list[Tensor]:
+    return [depth, *(part for vector in contacts for part in vector)]
 
 
 SHARED_FORCES = Operation("shared_forces", shared_forces, _shared_by_kernel, _inputs)

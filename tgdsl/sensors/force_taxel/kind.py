@@ -168,18 +168,8 @@ def forward(
     gathered: Gathered, context: Context, constants: ForceTaxelConstants[Tensor], state: State
 ) -> tuple[dict[str, Tensor], State]:
     """Return the force [N], the pressure [Pa] if wanted, and by body the missed force [N] and the residual moment [N·m]."""
-    contacts, touch = gathered[Contacts], gathered[ContactDepth]
-    shared = footprint.SHARED_FORCES(
-        constants,
-        touch.depth,
-        contacts.pos,
-        contacts.force,
-        contacts.torque,
-        contacts.normal,
-        contacts.net,
-        constants.footprint,
-        constants.levenberg,
-    )
+    contacts, depth = gathered[Contacts], gathered[ContactDepth].depth
+    shared = footprint.SHARED_FORCES(constants, depth, contacts, constants.footprint, constants.levenberg)
     readings = {"missed/signal": shared.missed, "residual/signal": shared.residual}
     if constants.inward is None:
         return {"signal": shared.force, **readings}, {}
