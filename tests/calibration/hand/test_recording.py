@@ -34,7 +34,7 @@ NEWTONS = replace(Calibration.none(), units="N", scale=np.full((5, 3), PER_COUNT
 
 
 def document(stiffness=300.0, links=TIP):
-    law = {"normal_stiffness": stiffness, "depth_exponent": 1, "normal_damping": 0, "shear_damping": 0, "outputs": ["force"]}
+    law = {"normal_stiffness": stiffness, "depth_exponent": 1, "normal_damping": 0, "shear_damping": 0}
     return {
         "tgdsl": 1,
         "robot": {"model": "xhand1"},
@@ -80,7 +80,7 @@ def log_of(folder, calibration=NEWTONS):
     states, force = [], np.zeros((30, 5, 3))
     for i, angles in enumerate(bent(BEND + 0.04 * np.sin(np.linspace(0, 6, 30))).astype(np.float32)):
         states.append(replace(readings[i].state, position=angles))
-        force[i, 1] = touch(tgdsl.read_mujoco(touch, *posed(angles)))["tip"][0].sum(dim=0)
+        force[i, 1] = touch(tgdsl.read_mujoco(touch, *posed(angles)))["tip"][0, :, :3].sum(dim=0)
     counts = np.round(NEWTONS.counts_of(force)).astype(np.int16)
     assert np.abs(counts[:, 1]).max() > 100
     readings = [replace(r, state=replace(s, total_force=c)) for r, s, c in zip(readings, states, counts, strict=True)]

@@ -33,7 +33,7 @@ from tgdsl.schema.load import read_spec
 
 Seconds = Annotated[float, Quantity("time", ge=0.0)]
 Newton = Annotated[float, Quantity("force")]
-_FORCE_CHANNELS = ("force_x", "force_y", "force_z")
+FORCE_CHANNELS = ("force_x", "force_y", "force_z")
 
 
 class Load(SpecModel):
@@ -174,8 +174,8 @@ def simulated_tip_forces(
         raise TgdslError(f"{path}: {name} has shape {reading.shape}, expected (step, more than {env}, {str(output.shape)[1:]}")
     taxels = touch.taxels[output.sensor]
     bodies = np.array(output.bodies) if output.rows == "body" else taxels["body"]
-    if set(_FORCE_CHANNELS) <= set(output.channels):
-        force = reading[:, env][:, :, [output.channels.index(name) for name in _FORCE_CHANNELS]].astype(np.float64)
+    if set(FORCE_CHANNELS) <= set(output.channels):
+        force = reading[:, env][:, :, [output.channels.index(name) for name in FORCE_CHANNELS]].astype(np.float64)
     elif output.channels[:1] == ("depth",):
         force = depth_scale * reading[:, env, :, :1].astype(np.float64) * taxels["normal"]
     else:

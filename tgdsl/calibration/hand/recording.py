@@ -11,6 +11,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from tgdsl.calibration.hand.loads import FORCE_CHANNELS
 from tgdsl.calibration.recordings import Arrays
 from tgdsl.errors import Problem, SpecError, listed
 from tgdsl.module.module import TactileModule
@@ -24,7 +25,7 @@ from tgdsl.scene.scene import scene_model
 def recording_of(log: HandLog, touch: TactileModule) -> Arrays:
     """Return a log as a recording for a module.
 
-    Its targets are the readings of three forces whose taxels are all on one fingertip: the sum over these taxels [N].
+    Its targets are the force readings whose taxels are all on one fingertip: the sum over these taxels [N].
 
     Raises:
         SpecError: If an object or the hand's base moves, the log's forces are counts, or no reading is such a force.
@@ -32,20 +33,19 @@ def recording_of(log: HandLog, touch: TactileModule) -> Arrays:
     """
     model = scene_model(touch.plan.scene)
     joints, bodies = joint_ids(model), [model.body(name).id for name in touch.inputs.names["body"]]
-    problems = []
+    mistakes = []
     if moving := [model.body(body).name for body in bodies if not set(_joints_above(model, body)) <= set(joints.tolist())]:
         hint = "weld it to the world where it was, or write a recording with its poses"
-        problems.append(Problem(str(log.path), 0, 0, "", f"a log lacks the poses of {listed(moving)}, which can move", hint))
+        mistakes.append((f"a log lacks the poses of {listed(moving)}, which can move", hint))
     if log.calibration is None or log.calibration.units != "N":
         hint = "record with --calibration; `tgdsl calibrate hand` fits one"
-        problems.append(Problem(str(log.path), 0, 0, "", "the log's forces are counts, expected newtons", hint))
+        mistakes.append(("the log's forces are counts, expected newtons", hint))
     targets = {output.name: finger for output in touch.outputs if (finger := _finger_of(output)) is not None}
     if not targets:
         problem = "no reading is the force on the taxels of one fingertip, which is all that a log has"
-        names_of_readings = listed([output.name for output in touch.outputs])
-        problems.append(Problem(str(log.path), 0, 0, "", problem, f"the document has {names_of_readings}"))
-    if problems:
-        raise SpecError(problems)
+        mistakes.append((problem, f"the document has {listed([output.name for output in touch.outputs])}"))
+    if mistakes:
+        raise SpecError([Problem(str(log.path), 0, 0, "", problem, hint) for problem, hint in mistakes])
     assert log.calibration is not None
     time, position = log.received_at - log.received_at[0], log.column("position").astype(np.float64)
     force = log.calibration.apply(log.column("total_force"))
@@ -55,6 +55,7 @@ def recording_of(log: HandLog, touch: TactileModule) -> Arrays:
     for name, finger in targets.items():
         arrays |= {f"target:{name}": force[:, None, finger], f"clock:{name}": time}
         arrays |= {f"rows:{name}": np.array("sum"), f"unit:{name}": np.array("N")}
+        arrays[f"channels:{name}"] = np.array(FORCE_CHANNELS)
     return arrays
 
 
@@ -69,8 +70,8 @@ def _joints_above(model: mujoco.MjModel, body: int) -> list[int]:
 
 
 def _finger_of(output: Output) -> int | None:
-    """Return the fingertip that all rows of a reading of three forces are on."""
-    is_force = output.rows == "taxel" and output.units == ("N",) * 3 and len(output.shape) == 2
+    """Return the fingertip that all taxels of a force reading are on."""
+    is_force = output.rows == "taxel" and set(FORCE_CHANNELS) <= set(output.channels) and len(output.shape) == 2
     return finger_of(output.bodies[0]) if is_force and len(output.bodies) == 1 else None
 
 
