@@ -1,16 +1,14 @@
-"""Contacts of the tasks' objects with the hand resist twisting, and the policies that are kept still act in these scenes."""
+"""Contacts of the tasks' objects with the hand resist twisting."""
 
 from pathlib import Path
 
 import pytest
 
 from tgdsl.rl.load import load_task
-from tgdsl.rl.playing.policy import check_card, read_policy
 from tgdsl.rl.sensed import compile_sensed
 from tgdsl.scene.scene import Choice, SceneModels
 
-ROOT = Path(__file__).parents[2]
-TASKS = ROOT / "examples" / "tasks"
+TASKS = Path(__file__).parents[2] / "examples" / "tasks"
 LIMITS = {
     "in_palm_rotate": ("item", 0.002),
     "in_hand_repose": ("item", 0.002),
@@ -39,10 +37,3 @@ def test_every_variant_of_an_object_resists_twisting(task):
         for i in colliding:
             assert model.geom_condim[i] == 4 and model.geom_friction[i, 1] == limit
             assert model.geom_priority[i] > max(model.geom_priority[j] for j in range(model.ngeom) if j not in geoms)
-
-
-@pytest.mark.parametrize("policy", ["in_palm_rotate_cube", "grip_force"])
-def test_kept_policies_act_in_them(policy):
-    saved = read_policy(ROOT / "policies" / f"{policy}.pt")
-    assert saved.card is not None
-    check_card(saved, saved.card["joints"], compile_sensed(load_task(TASKS / f"{policy}.yaml"), "cpu").touch)

@@ -6,14 +6,13 @@ import mujoco
 import numpy as np
 import pytest
 import small_tasks
-from small_runs import small_learner
+from written_teachers import teacher
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
 from tgdsl.rl.playing.policy import SCENE, changes_around, policy_for, provenance, read_policy
-from tgdsl.rl.train.folder import run_origin
 
-pytestmark = [pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning"), pytest.mark.usefixtures("no_onnx")]
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 IN_SCENE = [
     ("gravity", '<option timestep="0.005"', '<option timestep="0.005" gravity="0 0 -9.8"'),
     ("bodies", 'mass=".02"', 'mass=".021"'),
@@ -29,11 +28,9 @@ IN_SCENE = [
 
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory):
-    """A policy's file, which nobody has taught anything."""
+    """The file of a policy of the small task."""
     folder = tmp_path_factory.mktemp("learned")
-    learner, loaded = small_learner(folder)
-    learner.write_policy(learner.card(run_origin(loaded, learner.env, 0, {}, 1), 0.0, "tgdsl train"), folder / "policy.pt")
-    return folder / "policy.pt"
+    return teacher(folder / "policy.pt", load_task(small_tasks.small_task(folder)), ["proprio"])
 
 
 def changes(learned, folder):
