@@ -89,8 +89,7 @@ def test_a_screw_in_its_hole_is_part_of_the_body():
     assert found.volume.sum() == pytest.approx(1e-3 - 0.05**3, rel=1e-9)
 
 
-@pytest.mark.parametrize("sections", [8, 96])
-@pytest.mark.parametrize("cell", [0.1, 0.037])
+@pytest.mark.parametrize(("sections", "cell"), [(8, 0.1), (96, 0.1), (8, 0.037)])
 def test_edges_where_lines_of_sight_are(sections, cell):
     """A cylinder's edges and those of its caps run through its axis, along diagonals too, as lines of sight lie."""
     mesh = trimesh.creation.cylinder(0.3, 0.5, sections=sections)

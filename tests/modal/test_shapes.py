@@ -14,23 +14,17 @@ from tgdsl.modal.modes import Modes, ShapeModes, interpolated, of_groups
 LENGTH, HEIGHT, WIDTH = 0.4, 0.006, 0.01
 SIDE, THICKNESS = 0.2, 0.004
 UP = np.array([0.0, 0.0, 1.0])
-FOUND: dict[tuple, Modes] = {}
 
 
 @pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path))
+def shared_cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+    monkeypatch.setattr(spectra, "UNKNOWNS", 4000)
 
 
-def modes(mesh, count: int = 8) -> Modes:
-    """Return modes of a body: the same for all tests that ask for them again."""
-    known = (mesh.vertices.tobytes(), mesh.faces.tobytes(), count)
-    if known not in FOUND:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(spectra, "UNKNOWNS", 4000)
-            given = ShapeModes.model_construct(material=MATERIALS["steel"], count=count)
-            FOUND[known] = analysed("body", surface_of(mesh), given, 1e9)
-    return FOUND[known]
+def modes(mesh) -> Modes:
+    given = ShapeModes.model_construct(material=MATERIALS["steel"], count=6)
+    return analysed("body", surface_of(mesh), given, 1e9)
 
 
 def share(found: Modes, *pos: tuple[float, float, float], along: np.ndarray = UP) -> np.ndarray:
@@ -52,7 +46,7 @@ def test_the_first_node_of_a_beam_is_where_the_textbook_has_it():
 
 def test_the_other_side_is_struck_from_the_other_side():
     """Through a thin plate, displacement is that of both of its sides: shares differ by their sign alone."""
-    found = modes(box((SIDE, SIDE, THICKNESS)), 6)
+    found = modes(box((SIDE, SIDE, THICKNESS)))
     top = share(found, (0.03, 0.05, THICKNESS / 2), along=-UP)
     bottom = share(found, (0.03, 0.05, -THICKNESS / 2), along=UP)
     assert np.abs(top).max() > 0.5
@@ -61,16 +55,15 @@ def test_the_other_side_is_struck_from_the_other_side():
     assert top[:, ~single] == pytest.approx(bottom[:, ~single], abs=2e-3)
 
 
-def test_the_centre_of_a_square_plate_excites_even_modes_alone(monkeypatch):
+def test_the_centre_of_a_square_plate_excites_even_modes_alone():
     """Of the first four: xy, x² − y² and a pair have a node there; x² + y² has not."""
-    monkeypatch.setattr(spectra, "UNKNOWNS", 4000)
-    found = modes(box((SIDE, SIDE, THICKNESS)), 6)
+    found = modes(box((SIDE, SIDE, THICKNESS)))
     assert abs(share(found, (0.0, 0.0, THICKNESS / 2))[0, 2]) > 0.7
 
 
 def test_points_that_symmetry_makes_equal_are_struck_alike():
     """The four quadrants of a square plate, and the diagonal's mirror, for pairs of modes too."""
-    found = modes(box((SIDE, SIDE, THICKNESS)), 6)
+    found = modes(box((SIDE, SIDE, THICKNESS)))
     x, y, z = 0.031, 0.072, THICKNESS / 2
     got = np.abs(share(found, *[(a, b, z) for p, q in ((x, y), (y, x)) for a in (p, -p) for b in (q, -q)]))
     assert got == pytest.approx(np.broadcast_to(got[0], got.shape), abs=0.01)
@@ -80,12 +73,12 @@ def test_points_that_symmetry_makes_equal_are_struck_alike():
 @pytest.mark.parametrize(
     "mesh", [box((LENGTH, WIDTH, HEIGHT)), box((SIDE, SIDE, THICKNESS)), ball(0.05)], ids=["beam", "plate", "ball"]
 )
-def test_interpolation_is_as_exact_as_is_said(mesh, monkeypatch):
+def test_interpolation_is_as_exact_as_is_said(mesh, monkeypatch, tmp_path):
     """Against the elements' own displacement along the surface's normal, at points of the surface."""
     arguments = []
-    FOUND.clear()
+    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path))
     monkeypatch.setattr(spectra, "on_grid", lambda *given: arguments.append(given) or on_grid(*given))
-    found = modes(mesh, 6)
+    found = modes(mesh)
     ((elements, crossings, _, fields),) = arguments
     normal = np.einsum("xif,xi->xf", elements.displacement(crossings.cell, crossings.pos, fields), crossings.normal)
     exact = of_groups(normal, found.shapes.owner, len(found.frequency))
@@ -98,7 +91,7 @@ def test_interpolation_is_as_exact_as_is_said(mesh, monkeypatch):
 
 def test_shares_are_one_in_the_mean_over_the_surface():
     """The energy of an impulse somewhere on the surface is that of the mean gain."""
-    found, mesh = modes(box((SIDE, SIDE, THICKNESS)), 6), box((SIDE, SIDE, THICKNESS))
+    found, mesh = modes(box((SIDE, SIDE, THICKNESS))), box((SIDE, SIDE, THICKNESS))
     rng = np.random.default_rng(0)
     corners = rng.dirichlet(np.ones(3), 4000)
     which = rng.choice(len(mesh.faces), 4000, p=mesh.area_faces / mesh.area)
@@ -109,8 +102,8 @@ def test_shares_are_one_in_the_mean_over_the_surface():
 
 def test_a_body_that_is_moved_and_scaled():
     """Places are in the body's frame, in metres: points that correspond are struck alike."""
-    first = modes(box((LENGTH, WIDTH, HEIGHT)), 6)
-    moved = modes(box((2 * LENGTH, 2 * WIDTH, 2 * HEIGHT), at=(0.1, -0.2, 0.5)), 6)
+    first = modes(box((LENGTH, WIDTH, HEIGHT)))
+    moved = modes(box((2 * LENGTH, 2 * WIDTH, 2 * HEIGHT), at=(0.1, -0.2, 0.5)))
     at = np.array([0.07, 0.002, 0.003])
     other = 2 * at + np.array([0.1, -0.2, 0.5])
     assert share(moved, tuple(other)) == pytest.approx(share(first, tuple(at)), abs=1e-5)

@@ -25,8 +25,8 @@ FORCE, ALONG = 2.0, np.array([0.0, 0.0, -1.0])
 
 
 @pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path / "cache"))
+def shared_cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
     monkeypatch.setattr(spectra, "UNKNOWNS", 2500)
 
 
@@ -165,8 +165,9 @@ def test_listed_modes_have_no_shapes(tmp_path):
 
 
 @pytest.mark.parametrize("of", ["link", "object"])
-def test_what_is_said_of_modal_analysis(tmp_path, of):
-    """A line for each part that takes long, of each body; of what is kept already none of them."""
+def test_progress_of_modal_analysis(tmp_path, monkeypatch, of):
+    """A line for each long part, for each body; a cached result has none."""
+    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path / "cache"))
     for wanted in (["a grid of cells", "stiffness and mass of", "eigenproblem of", "mode shapes on a grid"], []):
         lines: list[str] = []
         tgdsl.compile(plate_document(tmp_path, modes="steel", samples=400, of=of), progress=lines.append)

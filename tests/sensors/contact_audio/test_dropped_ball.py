@@ -7,7 +7,6 @@ import pytest
 import torch
 from oracles.setups import sounds
 from oracles.setups.sounds import GRAVITY, HEIGHTS, MASS, loudest
-from oracles.sound import impact
 
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.warp import WarpSimulation
@@ -24,11 +23,12 @@ def dropped(tmp_path):
     return build
 
 
-def test_amplitude_grows_with_impulse():
-    """Six heights, a factor of 32: the slope of log amplitude over log impulse is 1, and the amplitude is the impulse."""
-    found = impact()
-    assert np.all(np.diff(found.exact) > 0) and np.all(found.exact > MASS * np.sqrt(2 * GRAVITY * HEIGHTS))
-    slope = np.polyfit(np.log(found.exact), np.log(found.ours), 1)[0]
+def test_amplitude_grows_with_impulse(dropped):
+    """Four heights, a factor of 8: the slope of log amplitude over log impulse is 1, and a ball that bounces has more than m v."""
+    heights = HEIGHTS[:4]
+    amplitude, impulse = loudest(*dropped(heights=heights), 0.11)
+    assert np.all(np.diff(impulse) > 0) and np.all(impulse > MASS * np.sqrt(2 * GRAVITY * heights))
+    slope = np.polyfit(np.log(impulse), np.log(amplitude), 1)[0]
     assert abs(slope - 1) < 0.05
 
 
@@ -46,7 +46,7 @@ def test_a_ball_at_rest_is_silent(dropped):
     """It is heard when it lands, and no more once it lies: neither as it goes on, nor in an episode that begins so."""
     sim, touch = dropped(heights=np.array([0.002]), stiffness="0.01 1")
     landing = max(float(_stepped(sim, touch).abs().max()) for _ in range(60))
-    for _ in range(900):
+    for _ in range(300):
         sim.step()
     touch.reset()
     resting = max(float(_stepped(sim, touch).abs().max()) for _ in range(60))
@@ -88,7 +88,7 @@ def test_reset_of_one_environment_silences_it(dropped):
     """The other one rings on as it would have."""
     heights = np.array([0.003, 0.003])
     (sim, touch), (twin, other) = dropped(heights=heights), dropped(heights=heights)
-    for _ in range(60):
+    for _ in range(40):
         read, same = _stepped(sim, touch), _stepped(twin, other)
     assert read.abs().amax(dim=(1, 2, 3)).min() > 0
     sim.reset(env_ids=[0])

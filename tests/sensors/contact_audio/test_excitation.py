@@ -5,21 +5,14 @@ import math
 import numpy as np
 import pytest
 import torch
-from oracles import sound as oracles
 from oracles.setups.sounds import STEP, half_sine, plate, pressed, sound, struck
+from oracles.sound import RUBS
 
 MODE = [{"frequency": 1000.0, "decay": 10.0, "gain": 1.0}]
 
 
-@pytest.mark.parametrize("duration", [0.0005, 0.004])
-def test_a_collision_strikes_once_with_its_impulse_whatever_the_number_of_steps(duration):
-    """0.02 N·s in one step to 16 steps: within the share T/τ of it, and alike for all steps."""
-    found = oracles.collision(duration)
-    assert max(found.ours) / min(found.ours) - 1 < 1.1 * duration / 0.02
-
-
 def test_twice_the_force_sounds_twice_as_loud(tmp_path):
-    one, two = (sound(plate(tmp_path, scrape=0), np.array(half_sine(0.003, STEP)) * k) for k in (1, 2))
+    one, two = (sound(plate(tmp_path, scrape=0), np.array(half_sine(0.003, STEP, rest=0.01)) * k) for k in (1, 2))
     np.testing.assert_allclose(two, 2 * one, rtol=0, atol=1e-12 * abs(one).max())
 
 
@@ -30,12 +23,12 @@ def test_a_steady_load_makes_no_sound(tmp_path):
 
 
 def test_a_slow_load_hardly_sounds(tmp_path):
-    """A load that rises for 0.3 s strikes once it no longer rises, with R τ²; as a blow of a step ΔF it would with ΔF Δt."""
+    """A load that rises for 0.15 s strikes once it no longer rises, with R τ²; as a blow of a step ΔF it would with ΔF Δt."""
     rate = 200.0
-    loads = np.minimum(np.arange(400) * STEP, 0.3) * rate
+    loads = np.minimum(np.arange(200) * STEP, 0.15) * rate
     impulse, last = struck(plate(tmp_path, modes=MODE, scrape=0), loads, MODE[0]["decay"])
     assert impulse == pytest.approx(rate * 0.02**2, rel=0.1)
-    assert 300 <= last <= 303
+    assert 150 <= last <= 153
 
 
 def test_the_next_collision_is_heard_for_itself(tmp_path):
@@ -53,10 +46,12 @@ def test_the_next_collision_is_heard_for_itself(tmp_path):
     np.testing.assert_allclose(found, sum(waves), rtol=0, atol=1e-12)
 
 
-def test_the_level_of_scraping_is_as_the_equation_says():
-    """The mean square of the samples is g² m_s F v/(4d): 10 dB for ten times the force or ten times the speed."""
-    found = oracles.scraping()
-    np.testing.assert_allclose(10 * np.log10(found.ours[1:] / found.ours[0]), 10, atol=1e-9)
+def test_scraping_is_ten_decibels_louder_by_ten_times_the_force_or_the_speed(tmp_path):
+    """The noise is the same; `oracles.sound.scraping` compares its level."""
+    touch = [plate(tmp_path, modes=MODE, scrape=1e-3) for _ in RUBS]
+    heard = [sound(own, np.full((5, 4), force), speed) for own, (force, speed) in zip(touch, RUBS, strict=True)]
+    level = [10 * np.log10((own**2).mean()) for own in heard]
+    np.testing.assert_allclose(np.array(level[1:]) - level[0], 10, atol=1e-9)
 
 
 def test_the_spectrum_of_scraping_is_that_of_the_modes(tmp_path):

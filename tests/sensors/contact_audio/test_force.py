@@ -30,8 +30,7 @@ def phasors(touch):
     return real + 1j * imag
 
 
-@pytest.mark.parametrize("step", [0.002, 0.001, 0.0005])
-@pytest.mark.parametrize("solref", ["0.02 1", "0.004 1"])
+@pytest.mark.parametrize(("step", "solref"), [(0.002, "0.02 1"), (0.001, "0.004 1"), (0.0005, "0.004 1")])
 def test_a_strike_is_the_momentum_that_it_changes(tmp_path, step, solref):
     """A mode of 1 Hz, slow to contacts of up to 40 ms: its amplitude is m Δv of a ball that MuJoCo throws on the plate."""
     (tmp_path / "thrown.xml").write_text(THROWN.format(step=step, solref=solref))
@@ -49,12 +48,12 @@ def test_a_strike_is_the_momentum_that_it_changes(tmp_path, step, solref):
     sim.qvel[:, 2] = -1.0
     sim.forward()
     touch(sim.state())
-    for _ in range(round(0.15 / step)):
+    for _ in range(round(0.06 / step)):
         sim.step()
         touch(sim.state())
     impulse = 0.05 * (float(sim.qvel[0, 2]) + 1.0)
     assert impulse > 0.05
-    assert np.abs(phasors(touch)) * math.exp(0.01 * 0.15) == pytest.approx(impulse, rel=0.01)
+    assert np.abs(phasors(touch)) * math.exp(0.01 * 0.06) == pytest.approx(impulse, rel=0.01)
 
 
 def test_a_force_that_is_linear_between_samples_is_exact_at_any_step(tmp_path):
@@ -123,7 +122,7 @@ def test_a_steady_force_adds_nothing(tmp_path):
 
 
 def test_twice_the_force_sounds_twice_as_loud_in_float32(tmp_path):
-    one, two = (sound(plate(tmp_path, torch.float32, **FORCE), np.array(half_sine(0.003, STEP)) * k) for k in (1, 2))
+    one, two = (sound(plate(tmp_path, torch.float32, **FORCE), np.array(half_sine(0.003, STEP, rest=0.01)) * k) for k in (1, 2))
     np.testing.assert_allclose(two, 2 * one, rtol=0, atol=1e-6 * np.abs(two).max())
 
 

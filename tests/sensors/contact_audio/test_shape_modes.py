@@ -14,6 +14,7 @@ from tgdsl.modal.analysis import analysed
 from tgdsl.modal.modes import ShapeModes
 
 SIDE, WALL = 0.1, 0.004
+STEEL = {"material": "steel", "count": 6}
 WALLS = "".join(
     f'<geom type="box" size="{" ".join(map(str, np.ptp(wall.vertices, axis=0) / 2))}" pos="{" ".join(map(str, wall.bounds.mean(axis=0)))}"/>'
     for wall in slabs(SIDE, WALL)
@@ -32,8 +33,8 @@ SCENE = """
 
 
 @pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path / "cache"))
+def shared_cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
     monkeypatch.setattr(spectra, "UNKNOWNS", 2500)
 
 
@@ -48,7 +49,7 @@ def document(folder, mesh: trimesh.Trimesh, **sensor) -> dict:
 
 def test_thin_walled_boxes_of_geoms_and_of_a_mesh(tmp_path):
     """Six slabs, and a mesh with an inner shell, which MuJoCo collides as its hull: both ring as the box with a cavity."""
-    touch = tgdsl.compile(document(tmp_path, thin_box(SIDE, WALL), modes={"material": "steel", "count": 6}, samples=64))
+    touch = tgdsl.compile(document(tmp_path, thin_box(SIDE, WALL), modes=STEEL, samples=64))
     planned = touch.plan.sensors[0].constants
     wanted = analysed("box", surface_of(thin_box(SIDE, WALL)), ShapeModes(material="steel", count=6), 0.45 * 64_000)
     assert len(wanted.frequency) >= 4
@@ -59,7 +60,7 @@ def test_thin_walled_boxes_of_geoms_and_of_a_mesh(tmp_path):
 
 def test_materials_are_told_apart_by_pitch_and_decay(tmp_path):
     """Bodies alike but for what they are made of: wood is lower than steel, and dies away sooner."""
-    modes = {"bodies": {"case": "wood"}, "modes": "steel", "samples": 32}
+    modes = {"bodies": {"case": "wood"}, "modes": STEEL, "samples": 32}
     planned = tgdsl.compile(document(tmp_path, thin_box(SIDE, WALL), **modes)).plan.sensors[0].constants
     assert planned["frequency"][1, 0] < 0.5 * planned["frequency"][0, 0]
     assert (planned["frequency"] > 0).sum(axis=1).min() >= 4
@@ -68,7 +69,7 @@ def test_materials_are_told_apart_by_pitch_and_decay(tmp_path):
 def test_a_mesh_without_an_inside_is_a_mistake_of_the_document(tmp_path):
     mesh = box((SIDE, SIDE, SIDE))
     mesh.update_faces(np.arange(12) > 1)
-    found = document(tmp_path, mesh, modes="steel")
+    found = document(tmp_path, mesh, modes=STEEL)
     text = (tmp_path / "plate.xml").read_text().replace('inertia="exact"', 'inertia="shell"')
     (tmp_path / "plate.xml").write_text(text)
     with pytest.raises(SpecError, match=r'sensors\.s\.modes: modes of "case": geom "case" is open: \d+ mm of edges'):
