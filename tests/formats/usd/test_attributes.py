@@ -5,6 +5,7 @@ what MJCF's documentation says of the attribute of the same name, and what the s
 """
 
 import math
+from collections import Counter, defaultdict
 from contextlib import contextmanager
 
 import mujoco
@@ -286,60 +287,79 @@ def plain(stage):
 
 
 @contextmanager
-def authored(stage, where, name, value):
-    """Have the stage hold one attribute for a while."""
-    prim = stage.GetPrimAtPath(PRIMS[where])
-    author(prim, name, value)
+def authored(stage, rows):
+    """Have the stage hold some attributes, rows of prim, name and value, for a while."""
+    prims = [(stage.GetPrimAtPath(PRIMS[where]), name, value) for where, name, value in rows]
+    for prim, name, value in prims:
+        author(prim, name, value)
     try:
         yield
     finally:
-        prim.RemoveProperty(name)
+        for prim, name, _ in prims:
+            prim.RemoveProperty(name)
 
 
-def test_what_is_read(stage, plain, subtests):
-    """No warning comes: warnings are errors."""
-    with authored(stage, "key", "mjc:ctrl", [0.0, 0.0]):
+def in_rounds(rows):
+    """Split rows into rounds: one attribute of each prim; all options of the scene in the first round, all flags in the second."""
+    rounds, following = defaultdict(list), Counter(scene=2)
+    for row in rows:
+        where, name = row[:2]
+        group = name.split(":")[1]
+        if group in ("option", "flag"):
+            rounds[("option", "flag").index(group)].append(row)
+        else:
+            rounds[following[where]].append(row)
+            following[where] += 1
+    return rounds.values()
+
+
+def test_each_attribute_of_the_schemas_sets_its_field(stage, plain, subtests):
+    """No attribute causes a warning: warnings are errors."""
+    with authored(stage, [("key", "mjc:ctrl", [0.0, 0.0])]):
         with_key = compiled(stage)
-    for where, name, value, field, expected in SEEN:
-        with subtests.test(where=where, name=name):
-            assert not np.array_equal(field(with_key if where == "key" else plain), expected)  # it is not so anyway
-            with authored(stage, where, name, value):
-                model = compiled(stage)
-            np.testing.assert_allclose(field(model), expected, rtol=1e-6)
+    for rows in in_rounds(SEEN):
+        with authored(stage, [row[:3] for row in rows]):
+            model = compiled(stage)
+        for where, name, _, field, expected in rows:
+            with subtests.test(where=where, name=name):
+                assert not np.array_equal(field(with_key if where == "key" else plain), expected)  # not the default
+                np.testing.assert_allclose(field(model), expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("where", "name", "array"), LIMITED, ids=[f"{row[0]}-{row[1]}" for row in LIMITED])
 @pytest.mark.parametrize("is_auto", [True, False], ids=["auto", "explicit"])
-def test_limits_hold_as_the_compiler_says(tmp_path, where, name, array, is_auto):
+def test_limits_hold_as_the_compiler_says(tmp_path, is_auto):
     """`auto` and `autoLimits` as in MJCF: a range is enough, or it never is; `true` and `false` are just that."""
     expected = {("auto", True): 1, ("auto", False): 0, ("true", False): 1, ("false", True): 0}
     for (token, is_autolimited), limited in expected.items():
         stage = schema_stage(tmp_path, f"{token}_{is_autolimited}.usda")
-        prim = stage.GetPrimAtPath(PRIMS[where])
-        names = [f"{name}Limited", f"{name}Range"] if where == "motor" else [f"{name}limited", f"{name}range"]
-        author(prim, f"mjc:{names[1]}:min", -1.0)
-        author(prim, f"mjc:{names[1]}:max", 1.0)
         author(stage.GetPrimAtPath("/scene"), "mjc:compiler:autoLimits", is_autolimited)
-        if not is_auto or token != "auto":
-            author(prim, f"mjc:{names[0]}", token)
-        assert getattr(compiled(stage), array)[0] == limited
+        for where, name, _ in LIMITED:
+            prim = stage.GetPrimAtPath(PRIMS[where])
+            flag, span = [f"{name}Limited", f"{name}Range"] if where == "motor" else [f"{name}limited", f"{name}range"]
+            author(prim, f"mjc:{span}:min", -1.0)
+            author(prim, f"mjc:{span}:max", 1.0)
+            if not is_auto or token != "auto":
+                author(prim, f"mjc:{flag}", token)
+        model = compiled(stage)
+        assert {array: getattr(model, array)[0] for *_, array in LIMITED} == {array: limited for *_, array in LIMITED}
 
 
-def test_what_is_not_read_is_named(stage, plain, subtests):
-    for where, name, value in flat(WARNED):
-        with subtests.test(where=where, name=name), authored(stage, where, name, value):
-            _, messages = warned(stage)
-            assert len(messages) == 1
-            assert name in messages[0] or name.rpartition(":")[0] in messages[0]
-            assert messages[0].endswith(PRIMS[where])
+def test_a_warning_names_each_attribute_that_is_not_read(stage):
+    """Attributes of one group may share a warning; no warning is about anything else."""
+    rows = flat(WARNED)
+    with authored(stage, rows):
+        _, messages = warned(stage)
+
+    def is_about(message, where, name):
+        return (name in message or name.rpartition(":")[0] in message) and message.endswith(PRIMS[where])
+
+    assert [row for row in rows if not any(is_about(message, *row[:2]) for message in messages)] == []
+    assert [message for message in messages if not any(is_about(message, *row[:2]) for row in rows)] == []
 
 
-def test_what_says_nothing_changes_nothing(stage, plain, subtests):
-    for where, name, value in flat(SILENT):
-        with subtests.test(where=where, name=name):
-            with authored(stage, where, name, value):
-                after = compiled(stage)
-            assert differing_fields(plain, after) == []
+def test_default_values_change_nothing(stage, plain):
+    with authored(stage, flat(SILENT)):
+        assert differing_fields(plain, compiled(stage)) == []
 
 
 def test_newtons_values_are_in_the_stages_units(tmp_path):

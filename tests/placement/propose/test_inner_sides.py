@@ -346,8 +346,8 @@ def test_a_tip_that_rolls_about_its_middle_closes_nothing(tmp_path):
 def hand_with_thumb(thumb: str, finger_range: str = "0 90") -> str:
     """Two fingers that curl from a palm, and a thumb."""
     finger = (
-        '<body name="{0}a" pos=".03 {1} .01"><joint name="{0}a" axis="0 1 0" range="{2}"/><geom type="capsule" fromto="0 0 0 0 0 .04" size=".007"/>'
-        '<body name="{0}b" pos="0 0 .05"><joint name="{0}b" axis="0 1 0" range="{2}"/><geom type="capsule" fromto="0 0 0 0 0 .03" size=".007"/>{3}'
+        '<body name="{0}a" pos=".03 {1} .01"><joint name="{0}a" axis="0 1 0" range="{2}"/><geom type="cylinder" fromto="0 0 0 0 0 .04" size=".007"/>'
+        '<body name="{0}b" pos="0 0 .05"><joint name="{0}b" axis="0 1 0" range="{2}"/><geom type="cylinder" fromto="0 0 0 0 0 .03" size=".007"/>{3}'
         "</body></body>"
     )
     marker = '<body name="{}" pos="0 0 .04"><geom type="sphere" size=".0003"/></body>'
@@ -359,10 +359,10 @@ def hand_with_thumb(thumb: str, finger_range: str = "0 90") -> str:
 
 
 THUMB = """<body name="t0" pos="-.03 0 .01"><joint name="t0" axis="0 1 0" range="-90 0"/>
-  <geom type="capsule" fromto="0 0 0 0 0 .04" size=".007"/>
-  <body name="t1" pos="0 0 .05"><joint name="t1" axis="0 1 0" range="-90 0"/><geom type="capsule" fromto="0 0 0 0 0 .02" size=".007"/>
+  <geom type="cylinder" fromto="0 0 0 0 0 .04" size=".007"/>
+  <body name="t1" pos="0 0 .05"><joint name="t1" axis="0 1 0" range="-90 0"/><geom type="cylinder" fromto="0 0 0 0 0 .02" size=".007"/>
     <body name="t2" pos="0 0 .03"><joint name="t2" axis="{}" range="{}"/>
-      <geom type="capsule" fromto="0 0 0 0 0 .03" size=".007"/></body></body></body>"""
+      <geom type="cylinder" fromto="0 0 0 0 0 .03" size=".007"/></body></body></body>"""
 
 
 def test_a_side_that_a_links_own_hinge_does_not_carry_it_to_is_weak(tmp_path):

@@ -66,12 +66,12 @@ class Flexion:
         bent = {joint: m.opened for joint, m in self.closing.motions.items() if self.closing.lean[joint]}
         self.straight = self.closing.poses.pose(bent)
         self.steps = {joint: self._step(joint) for joint in self.closing.motions}
+        self.moved = {joint: self._moving_joints(pose) for joint, pose in self.steps.items()}
         self.bars = self._bars()
 
     @property
     def num_closing(self) -> int:
-        moved = {self.closing.chain[self.closing.segment(j)] for step in self.steps.values() for j in self._moving_joints(step)}
-        return len(moved)
+        return len({self.closing.chain[self.closing.segment(joint)] for moved in self.moved.values() for joint in moved})
 
     @property
     def tips(self) -> list[int]:
@@ -80,7 +80,7 @@ class Flexion:
 
     def motion(self) -> dict[int, tuple[float, float]]:
         poses = self.closing.poses
-        moved = {j for step in self.steps.values() for j in self._moving_joints(step)}
+        moved = {joint for joints in self.moved.values() for joint in joints}
         return {j: (float(self.open[poses.at(j)]), float(self.shut[poses.at(j)])) for j in sorted(moved)}
 
     def inner_side(self, body: int) -> InnerSide:
@@ -144,7 +144,8 @@ class Flexion:
     def _moving_joints(self, pose: Float[np.ndarray, " qpos"]) -> list[int]:
         poses = self.closing.poses
         moved = {joint: abs(float(pose[poses.at(joint)] - self.open[poses.at(joint)])) for joint in poses.joints}
-        return [joint for joint, by in moved.items() if by > 1e-3 * max(moved.values(), default=0.0)]
+        least = 1e-3 * max(moved.values(), default=0.0)
+        return [joint for joint, by in moved.items() if by > least]
 
     def _frames(self, pose: Float[np.ndarray, " qpos"]) -> mujoco.MjData:
         return self.closing.poses.kinematics(pose)
@@ -152,8 +153,8 @@ class Flexion:
     def _nearest(self, segment: int) -> list[int]:
         """Return the joints that move a segment, the one that moves it nearest to itself first."""
         path, result = self.tree.path(segment), {}
-        for joint, pose in self.steps.items():
-            depths = [path.index(s) for s in map(self.closing.segment, self._moving_joints(pose)) if s in path]
+        for joint, moved in self.moved.items():
+            depths = [path.index(s) for s in map(self.closing.segment, moved) if s in path]
             if depths:
                 result[joint] = min(depths)
         return sorted(result, key=lambda joint: (result[joint], joint))
