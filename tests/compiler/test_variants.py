@@ -105,7 +105,7 @@ def cache(tmp_path_factory, monkeypatch):
 def test_a_batch_of_variants_is_as_many_single_runs(tmp_path, variants):
     touch = tgdsl.compile(document(tmp_path, "<geom size='.01'/>", variants=variants), dtype=torch.float64)
     assert touch.inputs.objects == ("item",) and touch.inputs.num_variants == (len(variants),)
-    state = touch.example_state(2 * len(variants), spread=0.01)
+    state = touch.example_state(len(variants), spread=0.01)
     readings, expected = touch(state), single_runs(tmp_path, variants, state)
     assert readings["depth"].amax() > 0.005
     for name, value in expected.items():
@@ -121,7 +121,7 @@ def test_meshes_among_the_variants(tmp_path, target):
         {"geoms": [{"mesh": "cone.stl", "pos": [0, 0, 0.02]}, {"mesh": "cone.stl", "quat": [0, 1, 0, 0]}]},
     ]
     touch = tgdsl.compile(document(tmp_path, "<geom size='.01'/>", variants=variants, **target), dtype=torch.float64)
-    state = touch.example_state(8, spread=0.01)
+    state = touch.example_state(len(variants), spread=0.01)
     readings, expected = touch(state), single_runs(tmp_path, variants, state, **target)
     assert readings["depth"].amax() > 0.005
     for name, value in expected.items():

@@ -258,11 +258,11 @@ def test_quiet(capfd):
 def test_many_points():
     vertices, faces = icosphere(5)
     mesh = TriangleMesh(vertices, faces)
-    points = 0.04 * np.random.default_rng(0).normal(size=(100_000, 3))
+    points = 0.04 * np.random.default_rng(0).normal(size=(20_000, 3))
     ask(mesh, points[:1])
-    start = time.perf_counter()
+    start = time.process_time()
     distance, _ = ask(mesh, points, dtype=torch.float32)
-    assert time.perf_counter() - start < 10
+    assert time.process_time() - start < 2
     np.testing.assert_allclose(distance, np.linalg.norm(points, axis=1) - 0.05, rtol=0, atol=5e-5)  # facets
 
 

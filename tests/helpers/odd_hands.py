@@ -57,14 +57,14 @@ TENDON = """
 # The bracket is behind the base.
 _SIDE = """
       <body name="{0}_driver" pos="{1} 0 .02" euler="0 0 {2}"><joint axis="0 1 0" range="0 45"/>
-        <geom type="capsule" fromto="0 0 0 0 0 .03" size=".004"/>
+        <geom type="cylinder" fromto="0 0 0 0 0 .03" size=".004"/>
         <body name="{0}_finger" pos="0 0 .04"><joint axis="0 1 0" range="-45 45"/>
           <geom type="box" size=".005 .008 .02" pos=".004 0 .02"/>
           <body name="{0}_pad" pos=".011 0 .03"><geom name="{0}_rubber" type="box" size=".002 .008 .01"/></body>
         </body>
       </body>
       <body name="{0}_rocker" pos="{3} 0 .02" euler="0 0 {2}"><joint axis="0 1 0" range="0 45"/>
-        <geom type="capsule" fromto="0 0 0 0 0 .03" size=".003"/></body>"""
+        <geom type="cylinder" fromto="0 0 0 0 0 .03" size=".003"/></body>"""
 FOUR_BAR = f"""
 <mujoco>
   <option><flag gravity="disable"/></option>

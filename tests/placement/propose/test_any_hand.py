@@ -6,8 +6,7 @@ import pytest
 from odd_hands import BALL, CAPSULES, HANDS, VISUAL, command, compiled
 
 import tgdsl
-from tgdsl.compiler.pipeline import placed
-from tgdsl.placement.propose.propose import FACTORS, escaped
+from tgdsl.placement.propose.propose import escaped
 from tgdsl.schema.load import load_layout
 
 PRESSED = 0.0005
@@ -121,15 +120,6 @@ def test_the_file_says_what_was_left_out_and_what_is_a_guess(odd):
     text = (folder / "layout.yaml").read_text()
     for line in LINES.get(hand.text, ()):
         assert line in text
-
-
-def test_no_taxel_is_unfelt_but_where_nothing_is_collided(odd):
-    """At every resolution; what the simulator does not collide is named in the file."""
-    hand, folder = odd
-    found = placed({"tgdsl": 1, "robot": {"model": str(folder / "hand.xml"), "layout": str(folder / "layout.yaml")}})
-    assert set(found.layouts) == set(FACTORS)
-    is_named = "none of these links collides in the simulator" in (folder / "layout.yaml").read_text()
-    assert any(found.unfelt.values()) == is_named == (not hand.collides)
 
 
 def test_counts_follow_the_resolution(odd):

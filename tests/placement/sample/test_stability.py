@@ -52,7 +52,7 @@ def palm(hand: str, ending: str = ".xml", folder: Path | None = None) -> Surface
 @pytest.mark.parametrize("name", SURFACES)
 def test_rows_stay_when_a_surface_is_written_otherwise(name):
     surface, keys = SURFACES[name]
-    shares = shares_of(surface, placement("poisson", **keys), {0.0: 1, 1e-8: 2, 1e-7: 2})
+    shares = shares_of(surface, placement("poisson", **keys), {0.0: 1, 1e-8: 1, 1e-7: 2})
     assert min(shares[0.0] + shares[1e-8]) == 1.0
     assert np.mean(shares[1e-7]) >= 0.99
 
@@ -61,8 +61,6 @@ def test_rows_stay_when_a_surface_is_written_otherwise(name):
     ("hand", "keys"),
     [
         pytest.param("xhand1", {"count": 297}, id="xhand1-count"),
-        pytest.param("xhand1", {"spacing": 0.006}, id="xhand1-spacing", marks=pytest.mark.slow),
-        pytest.param("sharpa", {"count": 297}, id="sharpa-count", marks=pytest.mark.slow),
         pytest.param("sharpa", {"spacing": 0.006}, id="sharpa-spacing", marks=pytest.mark.slow),
     ],
 )
@@ -89,9 +87,10 @@ def shares_of(surface: Surface, where: Placement, draws: dict[float, int]) -> di
 @pytest.mark.parametrize("hand", ["xhand1", pytest.param("sharpa", marks=pytest.mark.slow)])
 def test_rows_are_those_of_the_robot_that_was_exported_to_usd(hand, tmp_path):
     export_model(ROBOTS / hand / f"{hand}_right.xml", tmp_path / f"{hand}_right.usda")
+    palms = palm(hand), palm(hand, ".usda", tmp_path)
     for keys in ({"count": 297, "seed": 3}, {"spacing": 0.006}):
         where = placement("poisson", **keys)
-        first, second = (sample(surface, where, HERE) for surface in (palm(hand), palm(hand, ".usda", tmp_path)))
+        first, second = (sample(surface, where, HERE) for surface in palms)
         assert len(first.pos) == len(second.pos)
         np.testing.assert_allclose(second.pos, first.pos, rtol=0, atol=1e-6)
         np.testing.assert_allclose(second.normal, first.normal, rtol=0, atol=1e-4)
@@ -123,8 +122,8 @@ def test_rows_stay_when_faces_share_no_vertices(at):
 
 
 @pytest.mark.parametrize("name", ["ball", "spacing", "overlapping", "at_the_angle", "at_the_border"])
-def test_nearly_all_layouts_stay_whole_under_noise(name):
-    """40 copies of each of five surfaces, 200 in all, with vertices off by 1e-7 of the largest coordinate: no row of any moves."""
+def test_layouts_stay_whole_under_noise_of_float32(name):
+    """8 copies of each of five surfaces, with vertices off by 1e-7 of the largest coordinate: no row of any moves."""
     surface, keys = SURFACES[name]
-    shares = shares_of(surface, placement("poisson", **keys), {1e-7 * float(np.abs(surface.vertices).max()): 40})
-    assert [found for own in shares.values() for found in own] == [1.0] * 40
+    shares = shares_of(surface, placement("poisson", **keys), {1e-7 * float(np.abs(surface.vertices).max()): 8})
+    assert [found for own in shares.values() for found in own] == [1.0] * 8
