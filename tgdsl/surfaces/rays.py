@@ -198,25 +198,42 @@ def visible_rectangle(view: OrthographicView, region: Region) -> tuple[Float[np.
     if not len(extremes):
         return None
     uv = extremes @ view.axes[:2].T
-    hits = _raster_hits(view, region, uv.min(axis=0), uv.max(axis=0))
-    low, high = (hits.min(axis=0), hits.max(axis=0)) if len(hits) else (np.full(2, np.inf), np.full(2, -np.inf))
+    low, high = _raster_bounds(view, region, uv.min(axis=0), uv.max(axis=0))
     is_outside = ((uv < low) | (uv > high)).any(axis=1) & region.has_points(extremes)
     # A corner can be visible although its face is hidden: test a point slightly inside the face.
     tested = extremes[is_outside] + 1e-3 * (inner[is_outside] - extremes[is_outside])
     uvt = tested @ view.axes.T
     is_seen = first_hits(view, uvt[:, :2]).depth >= uvt[:, 2] - view.rounding - 3 * LENGTH_TOLERANCE
-    seen = np.concatenate([hits, uv[is_outside][is_seen]])
-    return (seen.min(axis=0), seen.max(axis=0)) if len(seen) else None
+    seen = uv[is_outside][is_seen]
+    low, high = np.minimum(low, seen.min(axis=0, initial=np.inf)), np.maximum(high, seen.max(axis=0, initial=-np.inf))
+    return (low, high) if (low <= high).all() else None
 
 
-def _raster_hits(
+def _raster_bounds(
     view: OrthographicView, region: Region, low: Float[np.ndarray, " 2"], high: Float[np.ndarray, " 2"]
-) -> Float[np.ndarray, "hit 2"]:
-    """Return the rays of a fine raster over a rectangle whose first hit is in the region."""
+) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]:
+    """Return the bounds of the rays of a fine raster over a rectangle whose first hit is in the region; (inf, −inf) without any.
+
+    Lines of the raster are followed from each side until one has such a hit.
+    """
     size = np.maximum(high - low, view.rounding)
     num = np.clip(np.ceil(RASTER * size / size.max()), 16, RASTER).astype(int)
-    u, v = (low[i] + (np.arange(num[i]) + 0.5) / num[i] * size[i] for i in range(2))
-    uv = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
+    lines = [low[i] + (np.arange(num[i]) + 0.5) / num[i] * size[i] for i in range(2)]
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for axis, bound, outermost in ((0, low, np.min), (0, high, np.max), (1, low, np.min), (1, high, np.max)):
+        across = lines[1 - axis]
+        inwards = lines[axis] if bound is low else lines[axis][::-1]
+        for some in np.split(inwards, [4, 16, 64]):
+            uv = np.stack(np.meshgrid(some, across, indexing="ij"), axis=-1).reshape(-1, 2)[:, :: 1 - 2 * axis]
+            hits = _in_region(view, region, uv)
+            if len(hits):
+                bound[axis] = outermost(hits[:, axis])
+                break
+    return low, high
+
+
+def _in_region(view: OrthographicView, region: Region, uv: Float[np.ndarray, "ray 2"]) -> Float[np.ndarray, "hit 2"]:
+    """Return the rays whose first hit is in the region."""
     hits = first_hits(view, uv)
     uv, face, depth = (array[hits.face >= 0] for array in (uv, hits.face, hits.depth))
     pos = np.column_stack([uv, depth]) @ view.axes
