@@ -23,7 +23,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array, csc_array, diags_array
+from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 from scipy.spatial import KDTree
@@ -116,12 +116,10 @@ class Elements:
     ) -> Float[np.ndarray, "x 3 mode"]:
         """Return what values of the unknowns are at points in cells."""
         within = (pos - self.filled.low[cell]) / self.filled.size[cell]
-        at = values.reshape(len(self.pos), 3, -1)
-        value = _shape_functions(within)[0]
-        result = np.zeros((len(cell), 3, at.shape[2]))
-        for node in range(NODES):
-            result += value[node][:, None, None] * at[self.nodes[cell, node]]
-        return result
+        weight = _shape_functions(within)[0].T.ravel()
+        starts = NODES * np.arange(len(cell) + 1)
+        weights = csr_array((weight, self.nodes[cell].ravel(), starts), shape=(len(cell), len(self.pos)))
+        return (weights @ values.reshape(len(self.pos), -1)).reshape(len(cell), 3, -1)
 
 
 SHIFT = -1e-3  # shift of the eigenvalues: below all of them, so that the factorised matrix is positive definite
