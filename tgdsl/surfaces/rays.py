@@ -118,16 +118,29 @@ def first_hits(view: OrthographicView, uv: Float[np.ndarray, "ray 2"]) -> Hits:
     return Hits(hit_face, nearest)
 
 
+def is_clear(view: OrthographicView, uvt: Float[np.ndarray, "ray 3"]) -> Bool[np.ndarray, " ray"]:
+    """Return which rays hit nothing before the depth `uvt[:, 2]` [m]."""
+    result, (a, b, c) = np.ones(len(uvt), dtype=bool), view.corners[:, :, 2].T
+    nearest = np.minimum(np.minimum(a, b), c)
+    for face, ray in _pairs(view, uvt[:, :2]):
+        is_before = nearest[face] < uvt[ray, 2]
+        _, ray, t = _hits(view, uvt[:, :2], face[is_before], ray[is_before])
+        result[ray[t < uvt[ray, 2]]] = False
+    return result
+
+
 def _hits(
     view: OrthographicView, uv: Float[np.ndarray, "ray 2"], face: Int[np.ndarray, " pair"], ray: Int[np.ndarray, " pair"]
 ) -> tuple[Int[np.ndarray, " hit"], Int[np.ndarray, " hit"], Float[np.ndarray, " hit"]]:
     """Return face, ray and depth of the pairs that meet."""
+    is_sparse = len(face) < len(view.corners)  # edges are computed for each pair then, for each face otherwise
     for i in range(3):
-        start, end = view.corners[:, i, :2], view.corners[:, (i + 1) % 3, :2]
-        along = end - start
+        corners, row = (view.corners[face], np.arange(len(face))) if is_sparse else (view.corners, face)
+        start = corners[:, i, :2]
+        along = corners[:, (i + 1) % 3, :2] - start
         inward = np.stack([-along[:, 1], along[:, 0]], axis=-1) / np.linalg.norm(along, axis=1, keepdims=True)
-        offset = uv[ray] - start[face]
-        is_inside = inward[face, 0] * offset[:, 0] + inward[face, 1] * offset[:, 1] >= -view.rounding
+        offset = uv[ray] - start[row]
+        is_inside = inward[row, 0] * offset[:, 0] + inward[row, 1] * offset[:, 1] >= -view.rounding
         face, ray = face[is_inside], ray[is_inside]
     corners = view.corners[face]
     slope = view.normals[face] @ view.axes.T
@@ -202,8 +215,7 @@ def visible_rectangle(view: OrthographicView, region: Region) -> tuple[Float[np.
     is_outside = ((uv < low) | (uv > high)).any(axis=1) & region.has_points(extremes)
     # A corner can be visible although its face is hidden: test a point slightly inside the face.
     tested = extremes[is_outside] + 1e-3 * (inner[is_outside] - extremes[is_outside])
-    uvt = tested @ view.axes.T
-    is_seen = first_hits(view, uvt[:, :2]).depth >= uvt[:, 2] - view.rounding - 3 * LENGTH_TOLERANCE
+    is_seen = is_clear(view, tested @ view.axes.T - [0.0, 0.0, view.rounding + 3 * LENGTH_TOLERANCE])
     seen = uv[is_outside][is_seen]
     low, high = np.minimum(low, seen.min(axis=0, initial=np.inf)), np.maximum(high, seen.max(axis=0, initial=-np.inf))
     return (low, high) if (low <= high).all() else None

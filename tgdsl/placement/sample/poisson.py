@@ -25,7 +25,7 @@ from scipy.spatial import KDTree
 
 from tgdsl.placement.sample import lattice
 from tgdsl.surfaces.meshlab import Shell, stratified_points
-from tgdsl.surfaces.rays import OrthographicView, first_hits, frame, sphere_directions
+from tgdsl.surfaces.rays import OrthographicView, frame, is_clear, sphere_directions
 from tgdsl.surfaces.region import Region
 from tgdsl.surfaces.surface import Surface
 
@@ -171,15 +171,15 @@ def _visible(
     directions: Float[np.ndarray, "direction 3"],
 ) -> Bool[np.ndarray, " n"]:
     """Return which points just above faces are visible from far away along some direction."""
-    is_visible = np.zeros(len(above), dtype=bool)
-    for direction in directions:
-        left = np.flatnonzero(~is_visible)
-        left = left[normal[left] @ direction < -0.05]
-        if not len(left):
-            continue
-        view = OrthographicView.of(shell.surface, frame(direction), shell.is_closed[shell.component])
-        uvt = above[left] @ view.axes.T
-        is_visible[left] = first_hits(view, uvt[:, :2]).depth >= uvt[:, 2]
+    # Most points are seen along the direction that is most opposed to their normal, so each is viewed from there first.
+    cosine = normal @ directions.T
+    opposed, is_visible = cosine.argmin(axis=1), np.zeros(len(above), dtype=bool)
+    for is_first in (True, False):
+        for i, direction in enumerate(directions):
+            left = np.flatnonzero(~is_visible & (cosine[:, i] < -0.05) & ((opposed == i) == is_first))
+            if len(left):
+                view = OrthographicView.of(shell.surface, frame(direction), shell.is_closed[shell.component])
+                is_visible[left] = is_clear(view, above[left] @ view.axes.T)
     return is_visible
 
 
