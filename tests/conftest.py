@@ -58,7 +58,12 @@ def no_onnx(monkeypatch):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the suite that kinds inherit, which has no marks: other people's pytest would not know them."""
+    """Mark the suite that kinds inherit, which has no marks: other people's pytest would not know them.
+
+    A third of its environments suffice here, where each kind has other tests too.
+    """
+    if suite := sys.modules.get("tgdsl.testing.conformance"):
+        suite.KindConformance.num_envs = 4
     for item in items:
         if getattr(item, "originalname", "") == "test_compiled_equals_eager":
             item.add_marker("slow")

@@ -61,7 +61,7 @@ def uneven(call: int) -> float:
     return DT * (1, 0.5, 3, 0.01, 20)[call % 5]
 
 
-def errors(noise: Noise, times: Any = even, calls: int = 40) -> np.ndarray:
+def errors(noise: Noise, times: Any = even, calls: int = 24) -> np.ndarray:
     """Feed both a random signal, reset some environments in between, and return how far they are apart at each call."""
     rng, definitions, found = np.random.default_rng(1), noise.references(), []
     signal = np.zeros((noise.num_envs, noise.layout.num_taxels, len(noise.channels)))

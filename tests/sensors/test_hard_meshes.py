@@ -46,8 +46,8 @@ def compiled(folder, mesh, probes, dtype, **target):
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path / "cache"))
+def shared_cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -65,8 +65,8 @@ def mesh_read(folder, parts, pos, query):
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path / "cache"))
+def shared_cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
 
 
 PAIR = (box(CUBE, (-0.02, 0, 0)), box(CUBE, (0.02, 0, 0)))

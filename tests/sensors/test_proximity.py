@@ -38,7 +38,6 @@ class TestProximityOverPointsAsInThePaper(KindConformance):
     kind = PROXIMITY
     parameters = {"backend": "points", "points": 600, "max_bytes": 2**22, "model": "paper", "torque_about": "link"}
     gates = ()
-    num_envs = 7
 
 
 class TestProximityOfOneRadius(KindConformance):

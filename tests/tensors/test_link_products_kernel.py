@@ -89,10 +89,12 @@ def test_the_torch_code_is_the_product(name):
     torch.testing.assert_close(products(*doubles), exact(*doubles), rtol=1e-13, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_not_a_number_stays_in_its_line_and_link():
     assert found("edges")["not a number"] == [True, True]
 
 
+@pytest.mark.slow
 def test_no_line_is_nothing():
     assert found("edges")["no line"] == [2, 0, 119]
 

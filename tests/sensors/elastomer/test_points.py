@@ -191,14 +191,14 @@ def test_variants_on_a_compound_link_equal_the_reference(tmp_path):
 
 def test_a_link_that_is_a_mesh_feels_like_the_primitive(tmp_path):
     """A finely meshed box for the pad, by its baked grid."""
-    trimesh.creation.box((0.06, 0.2, 0.2)).export(tmp_path / "slab.stl")
-    plain = cube_on(tmp_path)
+    trimesh.creation.box((0.02, 0.06, 0.06)).export(tmp_path / "slab.stl")
+    plain = cube_on(tmp_path, pad='<geom type="box" size=".01 .03 .03" pos="0 0 -.01" euler="0 90 0"/>')
     (tmp_path / "scene.xml").write_text("")
     asset = (
         '</body><body name="unused"/></worldbody><asset><mesh name="slab" file="slab.stl"/></asset><worldbody><body name="p">'
     )
     readings = []
-    for touch in (plain, cube_on(tmp_path, pad='<geom type="mesh" mesh="slab" pos="0 0 -.03" euler="0 90 0"/>' + asset)):
+    for touch in (plain, cube_on(tmp_path, pad='<geom type="mesh" mesh="slab" pos="0 0 -.01" euler="0 90 0"/>' + asset)):
         touch(state(touch, pos=[0, 0, HALF - D]))
         readings.append(touch(state(touch, pos=[3e-4, -2e-4, HALF - D]))["s"][0].numpy())
     assert np.abs(readings[1] - readings[0]).max() < 0.02 * np.abs(readings[0]).max()

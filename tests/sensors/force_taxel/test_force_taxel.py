@@ -66,7 +66,7 @@ def test_every_newton_is_somewhere(tmp_path):
     """Random contacts on, beside and far from the pad, more of them than slots, in float32: Σ f + missed = net to rounding."""
     rng = np.random.default_rng(0)
     touch = pad(tmp_path, dtype=torch.float32, slots=3)
-    for _ in range(50):
+    for _ in range(20):
         pos, force = rng.normal(size=(3, 3)) * [0.03, 0.03, 0.005] + [0, 0, 0.01], rng.normal(size=(3, 3))
         net = force.sum(axis=0) + rng.normal(size=3)
         readings = touch(made_up(touch, pos, force, net=net))
@@ -101,7 +101,7 @@ def test_a_contact_that_slides_off_hands_its_force_over(tmp_path):
     touch = pad(tmp_path)
     force = np.array([0.4, 0.0, -1.0])
     captured = []
-    for y in np.linspace(0.0, 0.045, 151):
+    for y in np.linspace(0.0, 0.045, 76):
         readings = touch(made_up(touch, [[0.002, y, 0.01]], [force]))
         total = readings["s"][0].sum(dim=0).numpy()
         np.testing.assert_allclose(total + readings["s/missed"][0, 0].numpy(), force, atol=1e-15)
@@ -109,16 +109,16 @@ def test_a_contact_that_slides_off_hands_its_force_over(tmp_path):
     captured = -np.array(captured)
     assert captured[0] == pytest.approx(1, abs=1e-12)
     assert captured[-1] == 0
-    # The smooth step over the squared distance: slope at most 3/2 · 2 y/(r_f² 3/4) = 4/r_f, in steps of 0.3 mm.
-    assert np.abs(np.diff(captured)).max() <= 12e-4 / FOOTPRINT
-    assert ((captured > 0.01) & (captured < 0.99)).sum() > 10
+    # The smooth step over the squared distance: slope at most 3/2 · 2 y/(r_f² 3/4) = 4/r_f, in steps of 0.6 mm.
+    assert np.abs(np.diff(captured)).max() <= 24e-4 / FOOTPRINT
+    assert ((captured > 0.01) & (captured < 0.99)).sum() > 5
 
 
 def test_a_contact_that_turns_around_an_edge_hands_its_force_over(tmp_path):
     """A ball rolls over the edge of the pad at the outermost taxels: the normal turns, and by a right angle all is missed."""
     touch = pad(tmp_path)
     forces = []
-    for angle in np.linspace(0, np.pi / 2, 151):
+    for angle in np.linspace(0, np.pi / 2, 76):
         normal = np.array([-np.sin(angle), 0, -np.cos(angle)])
         readings = touch(made_up(touch, [[0.025, 0.005, 0.01]], [normal], normal=normal))
         forces.append(readings["s"][0].numpy())
@@ -126,14 +126,13 @@ def test_a_contact_that_turns_around_an_edge_hands_its_force_over(tmp_path):
         np.testing.assert_allclose(total + readings["s/missed"][0, 0].numpy(), normal, atol=1e-15)
         assert (forces[-1] @ normal >= 0).all()
     # Slope of the smooth step at most 3/2 · 2/0.75, that of the force's direction 1.
-    assert np.abs(np.diff(forces, axis=0)).max() <= 5 * np.pi / 2 / 150
+    assert np.abs(np.diff(forces, axis=0)).max() <= 5 * np.pi / 2 / 75
 
 
 HANDS = {"xhand1": "*_link2", "sharpa": "*_elastomer"}
 
 
-@pytest.mark.parametrize("side", ["right", "left"])
-@pytest.mark.parametrize("hand", HANDS)
+@pytest.mark.parametrize(("hand", "side"), [("xhand1", "right"), ("sharpa", "left")])
 def test_the_nail_is_not_the_pad(hand, side):
     """What presses on the back of a fingertip is missed, though within the footprint of the pad's taxels; what presses there is not.
 
@@ -200,7 +199,7 @@ def test_no_taxel_leaves_the_contacts_cone(tmp_path):
     rng = np.random.default_rng(2)
     touch, friction = pad(tmp_path, moment_iterations=8), 0.6
     num_sheared = 0
-    for _ in range(50):
+    for _ in range(20):
         pos = np.column_stack([rng.uniform(-0.03, 0.03, (5, 2)), rng.uniform(0.008, 0.012, 5)])
         load, angle, part = rng.uniform(0.1, 2, 5), rng.uniform(0, 2 * np.pi, 5), rng.uniform(0, 1, 5)
         shear = friction * load * part * np.array([np.cos(angle), np.sin(angle)])
@@ -209,7 +208,7 @@ def test_no_taxel_leaves_the_contacts_cone(tmp_path):
         assert (z <= 0).all()
         assert (np.hypot(x, y) <= -friction * z + 1e-14).all()
         num_sheared += int((np.hypot(x, y) > 1e-3).sum())
-    assert num_sheared > 300
+    assert num_sheared > 120
 
 
 def test_splitting_a_contact_changes_nothing(tmp_path):

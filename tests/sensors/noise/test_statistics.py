@@ -1,4 +1,4 @@
-"""What a million samples of each stage look like. Bounds are of theory: 5 standard errors, or as unlikely (`KOLMOGOROV`)."""
+"""What up to a million samples of each stage look like. Bounds are of theory: 5 standard errors, or as unlikely (`KOLMOGOROV`)."""
 
 from typing import Any
 
@@ -36,12 +36,12 @@ def test_drift_is_a_random_walk():
     sigma = 1e-3
     noise, white = million({"drift": sigma}), million({"white_noise": 1.0})
     walk, steps, noises = np.zeros((SIDE, SIDE)), [], []
-    for _ in range(16):
+    for _ in range(8):
         found = reading(noise)
         steps.append(found - walk)
         noises.append(reading(white))
         walk = found
-    for apart in (1, 2, 15):
+    for apart in (1, 2, 7):
         assert abs(correlation(steps[0], steps[apart])) < 5
     assert abs(correlation(steps[-1], walk - steps[-1])) < 5
     assert abs(correlation(steps[-1][:, :-1], steps[-1][:, 1:])) < 5
@@ -50,7 +50,7 @@ def test_drift_is_a_random_walk():
     noise.reset(np.arange(0, SIDE, 2))
     found = reading(noise)
     assert variance_error(found[::2], sigma**2) < 5
-    assert variance_error(found[1::2], 17 * sigma**2) < 5
+    assert variance_error(found[1::2], 9 * sigma**2) < 5
 
 
 def test_dead_taxels():
@@ -111,12 +111,12 @@ def test_radii_are_uniform_at_each_step():
     assert abs(correlation(found[0][:, 1:], found[0][:, :-1])) < 5
 
 
-@pytest.mark.parametrize("parts", [0.1, 1.0, 2.0, 10.0])
+@pytest.mark.parametrize("parts", [0.1, 1.0, 10.0])
 def test_ages_are_independent(parts):
-    dt, low, high, num_envs = DT / parts, 10e-3, 18e-3, 5000
+    dt, low, high, num_envs = DT / parts, 10e-3, 18e-3, 1000
     noise = Noise({"read_delay": low, "jitter": high - low}, 2, num_envs=num_envs, dt=dt)
     ages, first = [], int(np.ceil(high / dt))
-    for call in range(first + 200):
+    for call in range(first + 100):
         found = noise.read(call * dt, dt)
         if call >= first:
             assert torch.equal(found[:, 0], found[:, 1])
@@ -142,7 +142,7 @@ def test_ranges_are_uniform_over_environments():
         "dead_probability": [0.2, 0.4], "gain": [[0.5, 0.6], [1, 2]], "radius_noise": [0, 1e-3], "dead_range": [[-1, 0], [2, 3]],
         "hysteresis": {"strength": [0, 1], "time_constant": [0.1, 0.2]}, "crosstalk": {"strength": [0, 0.5], "sigma": [1e-3, 2e-3]},
     }  # fmt: skip
-    noise = Noise(knobs, 1, num_envs=N, dt=2.0)
+    noise = Noise(knobs, 1, num_envs=N // 10, dt=2.0)
     numbers = pipeline.draws_of(noise.stages)
     drawn = {name for name, value in noise.constants.items() if name in numbers and value.ndim == 3}
     assert drawn == set(pipeline.draws_of(pipeline.STAGES)) - {"release_threshold"}
@@ -157,7 +157,7 @@ def test_ranges_are_uniform_over_environments():
     samples = {name: before[name].numpy().ravel() for name in sorted(drawn)}
     for name, sample in samples.items():
         low, high = noise.constants[name].flatten().tolist()
-        assert sample.shape == (N,)
+        assert sample.shape == (N // 10,)
         assert uniform_distance(sample, low, high) < KOLMOGOROV, name
         assert abs(correlation(sample[1:], sample[:-1])) < 5, name
         assert abs(correlation(sample, after[name].numpy().ravel())) < 5, name

@@ -55,8 +55,7 @@ def test_an_object_between_two_links_is_told_by_both_alike(tmp_path):
         torch.testing.assert_close(found[:8], found[8:], rtol=1e-14, atol=0)
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("cells", [[1, 1, 1], [10, 10, 10]])
+@pytest.mark.parametrize(("cells", "dtype"), [([1, 1, 1], torch.float32), ([10, 10, 10], torch.float64)])
 def test_nothing_leaves_the_range_of_what_there_is(tmp_path, cells, dtype):
     """For any step, conductivity and area, with two objects and another link at once, losses on; a few cells are a hard case of `oracles`."""
     rng = np.random.default_rng(1)
@@ -78,13 +77,13 @@ def test_nothing_leaves_the_range_of_what_there_is(tmp_path, cells, dtype):
             module.reset()
             state = heat_state(module, dt, contacts)
             begin(module, state)
-            for _ in range(4):
+            for _ in range(3):
                 readings = module(state)
                 every = torch.cat([readings["heat"][0, :, 0], readings["heat/objects"][0, :, 0]])
                 assert float(every.min()) >= -20.0 - slack and float(every.max()) <= 80.0 + slack
 
 
-@pytest.mark.parametrize(("dt", "duration"), [(0.001, 0.1), (0.004, 0.4), (0.02, 0.4)])
+@pytest.mark.parametrize(("dt", "duration"), [(0.001, 0.1), (0.02, 0.4)])
 def test_two_solids_exchange_what_their_cells_equations_say(tmp_path, dt, duration):
     """Twice 8 cells of 2 mm, against the exponential of all of them: αΔt/Δ² from 0.02 to 0.5."""
     own, cell, num, area = MATERIALS["aluminium"], 0.002, 8, 4e-4
@@ -131,9 +130,15 @@ def in_steps_and_parts(dt, steps, links, sensor, objects, contacts):
     return found
 
 
-@pytest.mark.parametrize("fourier", [0.6, 3.0])
-@pytest.mark.parametrize("cells", [[1, 1, 4], [2, 2, 2]])
-@pytest.mark.parametrize("temperatures", [(80.0, -20.0), (80.0, 80.0)])
+@pytest.mark.parametrize(
+    ("temperatures", "cells", "fourier"),
+    [
+        ((80.0, -20.0), [1, 1, 4], 0.6),
+        ((80.0, 80.0), [2, 2, 2], 0.6),
+        ((80.0, -20.0), [2, 2, 2], 3.0),
+        ((80.0, 80.0), [1, 1, 4], 3.0),
+    ],
+)
 def test_two_contacts_on_a_thin_link_exchange_what_its_cells_equations_say(temperatures, cells, fourier):
     """A copper link of 1 cm between two bodies, in steps of αΔt/L²: its cells are right to 1 % of what there is."""
     copper = MATERIALS["copper"]
@@ -148,8 +153,7 @@ def test_two_contacts_on_a_thin_link_exchange_what_its_cells_equations_say(tempe
     np.testing.assert_allclose(found.sum(axis=1), exact.sum(axis=1), rtol=0.01)
 
 
-@pytest.mark.parametrize("fourier", [4.0, 30.0])
-@pytest.mark.parametrize("area", [2e-6, 4e-5, 2e-4])
+@pytest.mark.parametrize(("fourier", "area"), [(30.0, 2e-6), (4.0, 4e-5), (30.0, 2e-4)])
 def test_spots_take_up_what_their_cells_equations_say_from_the_first_step_on(area, fourier):
     """On a cube of 20 mm in 4³ cells, αΔt/L² up to 1.9."""
     metal = MATERIALS["aluminium"]
@@ -215,7 +219,7 @@ def test_a_link_that_is_pinched_does_not_swing(tmp_path):
 def test_reading_more_often_reads_the_same(tmp_path):
     """At every physics step or at every fifth, while skin warms by 1 K: what differs is of second order in the step."""
     found = {}
-    for dt in (2.0, 1.0, 0.5):
+    for dt in (2.0, 1.0):
         for every in (1, 5):
             module = heat_module(
                 tmp_path,
@@ -228,7 +232,7 @@ def test_reading_more_often_reads_the_same(tmp_path):
             for _ in range(round(10.0 / (dt * every / 5))):
                 readings = module(state)
             found[dt, every] = readings["heat"][0, :, 0]
-    apart = [float((found[dt, 1] - found[dt, 5]).abs().max()) for dt in (2.0, 1.0, 0.5)]
+    apart = [float((found[dt, 1] - found[dt, 5]).abs().max()) for dt in (2.0, 1.0)]
     assert cells_of(module).abs().max() > 0.1
     assert apart[0] < 1e-3
-    np.testing.assert_array_less(1.8, np.log2(np.divide(apart[:-1], apart[1:])))
+    assert apart[0] / apart[1] > 2**1.8

@@ -64,8 +64,7 @@ def test_the_waves_solve_the_equation():
         assert np.abs(residual).max() < 1e-3 * np.abs(RATE**2 * u(at)).max()
 
 
-@pytest.mark.parametrize("bulk", [0.0, 0.5, 5.0])
-@pytest.mark.parametrize("shape", ["l_shape", "ring", "plate"])
+@pytest.mark.parametrize(("shape", "bulk"), [("l_shape", 5.0), ("ring", 0.5), ("plate", 0.0)])
 def test_exact_solutions(shape, bulk):
     surface = {
         "l_shape": pads.l_shape(),
@@ -82,25 +81,23 @@ def test_exact_solutions(shape, bulk):
     assert error < RULE * np.abs(field(pad.edge_pos[:, :2])).max()
 
 
-@pytest.mark.parametrize("shape", [pads.l_shape(), pads.ring()], ids=["l_shape", "ring"])
-def test_order_of_convergence(shape, monkeypatch):
+def test_order_of_convergence(monkeypatch):
     """Quadratic elements of one size on a polygon: third order."""
     monkeypatch.setattr("tgdsl.sensors.elastomer.clamped.pad.GRADE", 1e-3)
     places = RANDOM.uniform(-9, 9, (100, 2)) * MM
     reach = np.hypot(*places.T)
-    places = places[((places < 0).any(axis=1)) & (reach > 4 * MM) & (reach < 9.7 * MM)]
+    places = places[(reach > 4 * MM) & (reach < 9.7 * MM)]
     field = waves(2.0)
     sizes = np.array([1.2, 0.6, 0.3]) * MM
     errors = []
     for size in sizes:
-        error = solved(plate_pad(shape, places, float(size)), field, 2.0) - field(places)
+        error = solved(plate_pad(pads.ring(), places, float(size)), field, 2.0) - field(places)
         errors.append(np.sqrt((error**2).mean()))
     assert np.polyfit(np.log(sizes), np.log(errors), 1)[0] > 2.7
 
 
-@pytest.mark.parametrize("bulk", [0.0, 3.0])
 @pytest.mark.parametrize("axis", [0, 1])
-def test_a_long_strip(axis, bulk):
+def test_a_long_strip(axis, bulk=3.0):
     """One long side moves, the other is held: sinh κ(W − y) / sinh κW; κ is the smaller by √(1 + K) for motion across it."""
     width = 8 * MM
     y = np.linspace(0.3, 7.5, 25) * MM
@@ -119,9 +116,7 @@ def test_a_long_strip(axis, bulk):
         np.testing.assert_allclose(expected[:10, 0], np.exp(-rate * y[:10]), atol=3e-3)
 
 
-@pytest.mark.parametrize(
-    ("data", "bulk"), [("radial", 0.0), ("radial", 4.0), ("around", 0.0), ("around", 4.0), ("constant", 0.0)]
-)
+@pytest.mark.parametrize(("data", "bulk"), [("radial", 4.0), ("around", 4.0), ("constant", 0.0)])
 def test_a_disc(data, bulk):
     """I1(κr)/I1(κR) for radial data (κ with K) and data around (without); I0(κr)/I0(κR) for a shift of the edge (K = 0)."""
     radius = 10 * MM
@@ -139,13 +134,12 @@ def test_a_disc(data, bulk):
     np.testing.assert_allclose(solved(pad, directions[data], bulk), expected, atol=RULE)
 
 
-@pytest.mark.parametrize("bulk", [0.0, 7.0])
-def test_without_drag_a_linear_displacement_is_exact(bulk):
+def test_without_drag_a_linear_displacement_is_exact():
     """The patch test: shift, turn and stretch of the edge reach every taxel unchanged, to rounding."""
     places = RANDOM.uniform(-9, -1, (30, 2)) * MM
     pad = plate_pad(pads.l_shape(), places)
     matrix, shift = RANDOM.normal(size=(2, 2)) / (10 * MM), RANDOM.normal(size=2)
-    np.testing.assert_allclose(solved(pad, lambda at: at @ matrix.T + shift, bulk, 0.0), places @ matrix.T + shift, atol=1e-9)
+    np.testing.assert_allclose(solved(pad, lambda at: at @ matrix.T + shift, 7.0, 0.0), places @ matrix.T + shift, atol=1e-9)
 
 
 def test_one_triangle_without_inner_nodes():
@@ -168,15 +162,15 @@ def test_a_taxel_at_the_edge_moves_with_it():
     np.testing.assert_allclose(solved(pad, lambda at: at / MM, 1.0), places / MM, atol=1e-8)
 
 
-@pytest.mark.parametrize("surface", [pads.plate(cells=(40, 32)), pads.slivers()], ids=["fine", "slivers"])
-def test_the_triangles_of_the_surface_do_not_matter(surface):
+def test_the_triangles_of_the_surface_do_not_matter():
+    """Many alike, or slivers."""
     places = RANDOM.uniform([1, 1], [24, 19], (40, 2)) * MM
     want = solved(plate_pad(pads.plate(), places), waves(2.0), 2.0)
-    np.testing.assert_allclose(solved(plate_pad(surface, places), waves(2.0), 2.0), want, atol=RULE * np.abs(want).max())
+    for surface in (pads.plate(cells=(40, 32)), pads.slivers()):
+        np.testing.assert_allclose(solved(plate_pad(surface, places), waves(2.0), 2.0), want, atol=RULE * np.abs(want).max())
 
 
-@pytest.mark.parametrize("cells", [(64, 1), (300, 4)])
-def test_a_half_cylinder_is_the_rectangle_of_its_arc(cells):
+def test_a_half_cylinder_is_the_rectangle_of_its_arc():
     """A field of arc and height on its edge reaches the taxels as on the flat rectangle; facets shift the edge by their angle."""
     radius, length = 8 * MM, 20 * MM
     arc, along = RANDOM.uniform(-11.5, 11.5, 50) * MM, RANDOM.uniform(1, 19, 50) * MM
@@ -185,7 +179,7 @@ def test_a_half_cylinder_is_the_rectangle_of_its_arc(cells):
     flat = plate_pad(flat_surface, np.stack([arc, along], axis=1))
     want = solved(flat, field, 2.0)
     normal = np.stack([np.cos(arc / radius), np.sin(arc / radius), 0 * arc], axis=1)
-    pad = unroll(pads.cylinder(radius, np.pi, length, cells), radius * normal + along[:, None] * pads.UP, normal, SIZE)
+    pad = unroll(pads.cylinder(radius, np.pi, length, (64, 1)), radius * normal + along[:, None] * pads.UP, normal, SIZE)
     angle = np.arctan2(pad.edge_pos[:, 1], pad.edge_pos[:, 0])
     on_edge = field(np.stack([radius * angle, pad.edge_pos[:, 2]], axis=1))
     tangents = np.stack(

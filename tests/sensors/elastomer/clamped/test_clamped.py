@@ -103,7 +103,6 @@ class Clamped(KindConformance):
         "boundary": {"pad": {"facing": [0, 0, 1], "within": "20 deg"}, "drag": 0.5, "bulk": 0.8},
     }  # fmt: skip
     gates = ("geometric",)
-    num_envs = 6
     test_taxel_permutation_commutes = None  # its taxels are on no pad
     test_compiled_equals_eager = None  # its graph is that of a pad whose edge is free
 
