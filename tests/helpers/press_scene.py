@@ -21,3 +21,5 @@ sensors:
   touch: {kind: kinematic_taxel, links: all, feels: [ball]}
   near: {kind: proximity, links: all, feels: [ball]}
 """
+WITHOUT_PROXIMITY = DOCUMENT.split("  near:")[0]
+"""For objects with variants, whose quadrature takes seconds to compile."""

@@ -19,7 +19,7 @@ from box_hands import BOX_HAND
 from faulty_lines import FaultyEmulator
 from first_order_hands import first_order_hand
 from hand_logs import write_log
-from press_scene import DOCUMENT, SCENE
+from press_scene import DOCUMENT, SCENE, WITHOUT_PROXIMITY
 from scipy.spatial.transform import Rotation
 from silent_browser import silent_browser
 from xhand1_hands import PATIENT
@@ -389,7 +389,7 @@ def test_objects_have_the_colours_of_their_materials():
 def test_another_environment_shows_its_own_object(document):
     own = document.with_name("variants.yaml")
     shapes = "variants: [{type: sphere, size: [20 mm], density: 600}, {type: box, size: [10 mm, 12 mm, 14 mm], density: 600}]"
-    own.write_text(DOCUMENT.replace("{body: ball}", f"{{body: ball, {shapes}}}"))
+    own.write_text(WITHOUT_PROXIMITY.replace("{body: ball}", f"{{body: ball, {shapes}}}"))
     with opened(SceneStage(tgdsl.compile(own), num_envs=2)) as page:
         assert page.panel.env is not None
         ball = page.stage.model.body("ball").id

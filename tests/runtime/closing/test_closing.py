@@ -1,6 +1,8 @@
 """Hands without keyframes close on an object by themselves: two links or more are pressed, whatever drives the hand."""
 
+import functools
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import mujoco
@@ -13,8 +15,6 @@ from unscripted_hands import GRIPPER, URDF
 
 import tgdsl
 from tgdsl.errors import SimulationError
-from tgdsl.formats.robot import load_model
-from tgdsl.placement.propose.propose import escaped
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.closing.closing import GRIP, MOST, START, Closing, closing_of
 from tgdsl.runtime.rollout import controls_between, rollout
@@ -27,6 +27,8 @@ HANDS = {
     "capsules.xml": CAPSULES,
     "four_bar.xml": FOUR_BAR,
 }
+BALL_RADII = {"capsules.xml": 0.02, "tendon.xml": 0.016}
+"""Of balls that the hand can hold between fingers and palm: one of 12 mm the tendon hand presses 3 mm into its palm [m]."""
 SECONDS = 1.0
 HELD_ATOL = 2e-3
 """How far soft constraints let held joints go under the forces of a grip [rad, m]."""
@@ -34,25 +36,15 @@ SOLVER_RTOL = 0.02
 """What presses is at rest up to the drag of the object."""
 
 
-def module(
-    folder: Path, name: str, text: str, objects: dict | None = None, scene: str = "", without: tuple[str, ...] = ()
-) -> tgdsl.TactileModule:
-    """Compile a hand with a few taxels and a contact sensor on each body with geoms."""
+def module(folder: Path, name: str, text: str, objects: dict | None = None, scene: str = "") -> tgdsl.TactileModule:
+    """Compile a hand with a contact sensor on each body with geoms."""
     (folder / name).write_text(text)
-    robot = load_model(folder / name)
-    links = [body for body in robot.bodies[1:] if robot.touchable(body) and body not in without]
+    objects = objects or {"ball": BALL}
     document = {
         "tgdsl": 1,
-        "robot": {
-            "model": str(folder / name),
-            "layout": {
-                "resolutions": {
-                    "r": {escaped(b): {"method": "poisson", "count": 4, "radius": "4 mm", "exposed": True} for b in links}
-                }
-            },
-        },
-        "objects": objects or {"ball": BALL},
-        "sensors": {"load": {"kind": "link_contact", "links": "*", "feels": list(objects or {"ball": BALL})}},
+        "robot": {"model": str(folder / name)},
+        "objects": objects,
+        "sensors": {"load": {"kind": "link_contact", "links": "*", "feels": list(objects)}},
     }
     if scene:
         (folder / "scene.xml").write_text(scene)
@@ -72,6 +64,18 @@ def closed(touch: tgdsl.TactileModule, num_envs: int = 1) -> tuple[Closing, Batc
     return closing, sim, touch(sim.state())["load"][..., 1:].norm(dim=-1)
 
 
+@pytest.fixture(scope="module")
+def closed_on_ball(tmp_path_factory) -> Callable[[str], tuple[Closing, BatchSimulation, torch.Tensor]]:
+    """Close a hand of `HANDS` on a ball, once."""
+
+    @functools.cache
+    def close(name: str) -> tuple[Closing, BatchSimulation, torch.Tensor]:
+        ball = {"geom": {"type": "sphere", "size": [BALL_RADII.get(name, 0.012)]}}
+        return closed(module(tmp_path_factory.mktemp("hand"), name, HANDS[name], {"ball": ball}))
+
+    return close
+
+
 def forces_on(sim: BatchSimulation, body: str, env: int = 0) -> dict[str, float]:
     """Return the normal forces between a body and others, by MuJoCo's own function [N]."""
     model, force, found = sim.env_model(env), np.zeros(6), dict[str, float]()
@@ -89,16 +93,13 @@ def forces_on(sim: BatchSimulation, body: str, env: int = 0) -> dict[str, float]
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", HANDS)
-def test_at_least_two_links_are_pressed(tmp_path, name):
-    # A ball that the hand can hold between fingers and palm: of 12 mm the tendon hand presses it 3 mm into its palm.
-    ball = {"geom": {"type": "sphere", "size": [{"capsules.xml": 0.02, "tendon.xml": 0.016}.get(name, 0.012)]}}
-    touch = module(tmp_path, name, HANDS[name], {"ball": ball})
-    closing, sim, load = closed(touch)
+def test_at_least_two_links_are_pressed(closed_on_ball, name):
+    closing, sim, load = closed_on_ball(name)
     pressed = {link for link, force in forces_on(sim, "ball").items() if force > 0}
     assert len(pressed) >= 2 and (load[0] > 0).sum() >= 2
     assert torch.isfinite(sim.qpos).all() and closing.target == "ball" and closing.place is not None
     depth = -min(contact.dist for contact in _contacts(sim))
-    assert depth < 0.2 * ball["geom"]["size"][0]  # forces that soft contacts can bear
+    assert depth < 0.2 * BALL_RADII.get(name, 0.012)  # forces that soft contacts can bear
 
 
 def _contacts(sim: BatchSimulation):
@@ -109,10 +110,9 @@ def _contacts(sim: BatchSimulation):
 
 
 @pytest.mark.slow
-def test_a_gripper_presses_with_the_object_s_weight_and_its_arm_stays(tmp_path):
+def test_a_gripper_presses_with_the_object_s_weight_and_its_arm_stays(closed_on_ball):
     """By virtual work a servo that both jaws follow gives each half its force; the arm's motor, at zero, bears nothing."""
-    touch = module(tmp_path, "gripper.xml", GRIPPER)
-    closing, sim, _ = closed(touch)
+    closing, sim, _ = closed_on_ball("gripper.xml")
     assert str(closing) == "the hand closes on `ball`, put between the fingers, without gravity; 1 of 1 joints"
     np.testing.assert_allclose(closing.place[:2], 0.0, atol=1e-9)  # midway between the jaws
     mass = float(sim.model.body("ball").mass[0])
@@ -133,20 +133,20 @@ def test_forces_are_bounded_on_a_heavy_object(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_same_scene_closes_alike(tmp_path):
-    first, second = (closed(module(tmp_path, "gripper.xml", GRIPPER))[1].qpos for _ in range(2))
-    assert torch.equal(first, second)
+def test_the_same_scene_closes_alike(closed_on_ball, tmp_path):
+    _, sim, _ = closed(module(tmp_path, "gripper.xml", GRIPPER))
+    assert torch.equal(sim.qpos, closed_on_ball("gripper.xml")[1].qpos)
 
 
 @pytest.mark.slow
-def test_a_floating_hand_stays_where_it_is(tmp_path):
-    _, sim, _ = closed(module(tmp_path, "tendon.xml", TENDON))
+def test_a_floating_hand_stays_where_it_is(closed_on_ball):
+    _, sim, _ = closed_on_ball("tendon.xml")
     np.testing.assert_allclose(sim.qpos[0, :3], [0, 0, 0.3], atol=HELD_ATOL)
 
 
 @pytest.mark.slow
-def test_a_urdf_s_second_joints_follow_the_first(tmp_path):
-    closing, sim, _ = closed(module(tmp_path, "three fingers.urdf", URDF))
+def test_a_urdf_s_second_joints_follow_the_first(closed_on_ball):
+    closing, sim, _ = closed_on_ball("three fingers.urdf")
     assert [servo.joint for servo in closing.servos] == ["a_1", "b_1", "thumb_1"] and closing.num_joints == 3
     for name in ("a", "b", "thumb"):
         one, two = (float(sim.qpos[0, sim.joints[f"{name}_{i}"].qpos]) for i in (1, 2))

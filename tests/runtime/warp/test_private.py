@@ -17,8 +17,8 @@ REPOSITORY = Path(__file__).parents[3]
 
 def private_lines(file: Path) -> list[int]:
     """Return the lines that name `_src`: as an attribute, in an import, or alone in a string."""
-    found = []
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    found, text = [], file.read_text(encoding="utf-8")
+    for node in ast.walk(ast.parse(text)) if "_src" in text else ():
         if isinstance(node, ast.ImportFrom):
             names = [node.module or "", *(alias.name for alias in node.names)]
         elif isinstance(node, ast.Import):
