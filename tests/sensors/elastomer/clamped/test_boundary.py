@@ -97,9 +97,9 @@ def test_order_of_convergence(monkeypatch):
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_a_long_strip(axis, bulk=3.0):
+def test_a_long_strip(axis):
     """One long side moves, the other is held: sinh κ(W − y) / sinh κW; κ is the smaller by √(1 + K) for motion across it."""
-    width = 8 * MM
+    width, bulk = 8 * MM, 3.0
     y = np.linspace(0.3, 7.5, 25) * MM
     pad = plate_pad(pads.plate(60 * MM, width), np.stack([np.full(25, 30 * MM), y], axis=1), 0.29 * MM)
 
