@@ -1,30 +1,20 @@
-"""Descriptions of observations: who follows one alone, from MuJoCo's raw state, gets the observation."""
+"""Descriptions of observations: a description and MuJoCo's raw state are enough to compute the observation."""
 
 import math
 import re
-from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 import torch
-from tiny_tasks import tiny_env
+from pincer_tasks import pincer_env
+from tiny_tasks import RADIUS, tiny_env
 
-from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.sensed import Felt
 
-FOLDER = Path(__file__).parents[2] / "examples" / "tasks"
-PLAIN = {
-    "physics.substeps": 1,
-    "variants": [0],
-    "touch": "depth",
-    "randomise.friction": 1,
-    "randomise.mass": 0,
-    "physics.cone": "elliptic",
-    "proprio.vel_scale": 0.2,
-}
+PLAIN = {"physics.substeps": 1, "touch": "depth", "proprio.vel_scale": 0.2}
 """With one physics step, readings are of where the control step began."""
-TASKS = {"in_palm_rotate": {}, "screwdriver": {"grasps.num": 4}}
+TASKS = {"in_palm_rotate": (tiny_env, {}), "screwdriver": (pincer_env, {"variants": [0], "action.slide_scale": 1e-4})}
 GIVEN = ("qpos", "qvel", "ctrl", "qfrc_applied", "xfrc_applied", "qacc_warmstart")
 
 
@@ -60,7 +50,7 @@ class Raw:
         return found
 
     def signed_distance(self, point, body):
-        """To the surface of a body of boxes and cylinders."""
+        """To the surface of a body of boxes and spheres."""
         found = []
         for geom in np.flatnonzero(self.model.geom_bodyid == self.model.body(body).id):
             if not self.model.geom_contype[geom] and not self.model.geom_conaffinity[geom]:
@@ -70,8 +60,8 @@ class Raw:
             if self.model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
                 off = np.abs([x, y, z]) - size
             else:
-                assert self.model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CYLINDER
-                off = np.array([math.hypot(x, y) - size[0], abs(z) - size[1]])
+                assert self.model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE
+                off = np.array([np.linalg.norm([x, y, z]) - size[0]])
             found.append(np.linalg.norm(np.maximum(off, 0)) + min(0, off.max()))
         return min(found)
 
@@ -116,8 +106,8 @@ def rebuilt(raw, features, body):
     elif name == "angle_to_goal":
         value = [math.acos((np.trace(raw.goal().T @ raw.rotation(features.link)) - 1) / 2)]
     elif name == "distance":
-        assert features.note == "at most 0.1 m"
-        value = [min(0.1, raw.signed_distance(place, body)) for place, _ in raw.probes(features)]
+        assert features.note == "at most 1 m"
+        value = [min(1.0, raw.signed_distance(place, body)) for place, _ in raw.probes(features)]
     else:
         assert name == "depth" and features.note == "0 while the solver has no contact of link and object"
         is_touched = bool(raw.contacts(features.link, body))
@@ -126,8 +116,9 @@ def rebuilt(raw, features, body):
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_an_observation_can_be_rebuilt_from_its_description(name):
-    env = TouchEnv(FOLDER / f"{name}.yaml", 1, threads=1, overrides=PLAIN | TASKS[name])
+def test_an_observation_can_be_rebuilt_from_its_description(tmp_path, name):
+    make, more = TASKS[name]
+    env = make(tmp_path, 1, overrides=PLAIN | more)
     generator, description, body = torch.Generator().manual_seed(0), env.describe(), env.task.setup.object
     data = mujoco.MjData(env.sim.env_model(0))
     data.qpos[:] = env.sim.qpos[0].numpy()
@@ -135,6 +126,8 @@ def test_an_observation_can_be_rebuilt_from_its_description(name):
     start, seen = data.body(body).xmat.reshape(3, 3).copy(), set()
     for step in range(40):
         action = 0.6 * torch.rand((1, env.num_actions), generator=generator) - 0.3
+        if name == "in_palm_rotate":
+            env.sim.qpos[0, 3:6] = torch.tensor([0.0255, 0.0, RADIUS])  # 0.5 mm in the right plate
         before = {name: env.sim.arrays[name][0].clone().numpy() for name in GIVEN}
         made = env.step(action)
         assert not made.info.ended

@@ -1,4 +1,4 @@
-"""An update is that of separate students, each taught alone in plain torch as the docstrings say: all of it in float64."""
+"""An update of a stack against students that are trained one by one in plain torch, in float64."""
 
 import math
 import random
@@ -45,11 +45,7 @@ class Chosen(NamedTuple):
 
 CHOSEN = {
     "plain": Chosen(),
-    "bounded": Chosen("inverse_variance", clip=0.02, max_grad_norm=4.0),
-    "decoders": Chosen(num_decoders=2),
-    "aggregate": Chosen(clip=0.02, aggregate=2),
-    "huber": Chosen("huber", clip=0.02, normalise=True),
-    "falling": Chosen(final_learning_rate=1e-4),
+    "huber": Chosen("huber", clip=0.02, normalise=True, final_learning_rate=1e-4),
     "all": Chosen("inverse_variance", clip=0.02, max_grad_norm=4.0, num_decoders=2, aggregate=2),
 }
 
@@ -149,7 +145,7 @@ def files(tmp_path_factory):
 
 @pytest.fixture
 def make(files, monkeypatch):
-    """Return a function that makes a distiller, of five students in three stacks, whose networks and rollouts are float64."""
+    """Return a function that makes a distiller, of three students in two stacks, whose networks and rollouts are float64."""
     made, (task, file) = [], files
 
     def distiller(kind: str, chosen: Chosen) -> Distiller:
@@ -163,7 +159,7 @@ def make(files, monkeypatch):
         widths |= {"touch_encoder.size": 6, "convolution.channels": "[2]"} | KINDS[kind]
         spec |= {f"networks.{name}": value for name, value in widths.items()}
         loaded = load_task(task, {f"distill.{name}": value for name, value in spec.items()})
-        keys = student_keys(["depth", "bool", "none"], ["ends", "all"], ["clean"], 1)
+        keys = student_keys(["depth", "bool", "none"], ["ends"], ["clean"], 1)
         own = Teacher(file, loaded)
         made.append(TouchEnv(loaded, ROWS * len(keys), seed=1, threads=1, feels=feels(keys, own.felt)))
         bound = own.bound(made[-1])
@@ -203,12 +199,9 @@ def filled(found: Distiller, generator: torch.Generator) -> list[Lesson]:
     return lessons
 
 
-@pytest.mark.parametrize(
-    ("kind", "chosen"),
-    [*((kind, chosen) for kind in KINDS for chosen in ("plain", "all")), *(("mlp", chosen) for chosen in list(CHOSEN)[1:-1])],
-)
+@pytest.mark.parametrize(("kind", "chosen"), [("mlp", "plain"), ("mlp", "huber"), ("lstm", "all"), ("convrnn", "all")])
 def test_an_update_is_that_of_separate_students(make, kind, chosen):
-    """Weights, normalisation and the errors that are told, after several updates."""
+    """Weights, normalisation and losses after several updates."""
     own = CHOSEN[chosen]
     found, generator, chance = make(kind, own), torch.Generator().manual_seed(0), random.Random(5)
     found._chance.seed(5)

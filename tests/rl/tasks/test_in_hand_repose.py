@@ -102,7 +102,9 @@ def compare(env, recorder, first_episode=2, kind="any"):
 
 @pytest.mark.parametrize("kind", ["any", "vertical"])
 def test_rewards_ends_and_scores_equal_the_reference(tmp_path, kind):
-    env = repose(tmp_path, 4, QUICK, "0 0 -9.81", kind)
+    """With weights that are not those of the task, each by another factor."""
+    weights = {name: (1.5 + 0.1 * i) * value for i, (name, value) in enumerate(InHandRepose.Rewards())}
+    env = repose(tmp_path, 4, QUICK, "0 0 -9.81", kind, overrides={"rewards": weights})
     recorder = Recorder(env)
     for i, action in enumerate(random_actions(env, 70)):
         env.sim.qvel[1, 6:9] = 3.0 if i % 4 else -3.0  # turned by hand: nothing else turns a ball
@@ -114,8 +116,9 @@ def test_rewards_ends_and_scores_equal_the_reference(tmp_path, kind):
     assert sum(rows["goal_timeout"].any() for rows in seen) >= 2 and sum(rows["drop"].any() for rows in seen) >= 1
     terms = set(InHandRepose.Rewards.model_fields) | {"is_over", "score"}
     assert {name for rows in seen for name, value in rows.items() if np.abs(value).max() > 1e-9} == terms
-    assert max(np.abs(rows["progress"]).max() for rows in seen) > 0.2 * 2  # what is faster the wrong way costs more
-    assert max(rows["progress"].max() for rows in seen) <= 0.2 * 2 + 1e-6
+    most = 2 * weights["progress"]
+    assert max(np.abs(rows["progress"]).max() for rows in seen) > most  # what is faster the wrong way costs more
+    assert max(rows["progress"].max() for rows in seen) <= most + 1e-6
 
 
 def test_goals_about_x_and_y_and_times_that_are_drawn_equal_the_reference(tmp_path):
@@ -323,14 +326,6 @@ def test_every_term_is_there(busy):
     assert all(term.abs().max() > 1e-9 for term in changed_terms(busy).values())
 
 
-@pytest.mark.parametrize("name", list(InHandRepose.Rewards.model_fields))
-def test_a_weight_scales_its_term_alone(busy, name):
-    weights = busy.spec.rewards
-    doubled = changed_terms(busy, rewards=weights.model_copy(update={name: 2 * getattr(weights, name)}))
-    for term, value in changed_terms(busy).items():
-        torch.testing.assert_close(doubled[term], value * (2 if term == name else 1))
-
-
 @pytest.mark.parametrize(
     ("name", "value", "term", "grows"),
     [
@@ -387,7 +382,7 @@ def test_the_documents_have_the_papers_numbers(document):
 @pytest.mark.parametrize(("document", "joints"), [(DOCUMENTS[0], 12), (DOCUMENTS[1], 22)], ids=["xhand1", "sharpa"])
 def test_each_hand_holds_all_objects_without_an_action(document, joints):
     quiet = {"touch": "none", "goal_timeout": "1000 s", "randomise.push": {"x": 0}}
-    env = TouchEnv(document, 32, threads=1, overrides=quiet)
+    env = TouchEnv(document, 16, threads=1, overrides=quiet)
     assert env.num_actions == joints and env.task.setup.num_variants == 16
     for _ in range(round(10 / env.control_step)):
         made = rest(env)
