@@ -99,11 +99,7 @@ def test_positive_values_close_the_fingers(robot, hands):
 @pytest.mark.parametrize(
     ("robot", "resolution"),
     [
-        ("xhand1", "med"),
-        pytest.param("xhand1", "low", marks=pytest.mark.slow),
-        pytest.param("xhand1", "high", marks=pytest.mark.slow),
-        pytest.param("sharpa", "low", marks=pytest.mark.slow),
-        pytest.param("sharpa", "med", marks=pytest.mark.slow),
+        ("xhand1", "low"),
         pytest.param("sharpa", "high", marks=pytest.mark.slow),
     ],
 )

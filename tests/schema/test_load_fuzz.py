@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tgdsl.errors import SpecError
 from tgdsl.schema.load import load
 
-FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FUZZ = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 WORDS = sorted(set(DOCUMENT.replace(":", " ").split()) | {"noise", "observations", "scene", "grid", "points", "box"})
 SCALARS = st.one_of(

@@ -17,35 +17,35 @@ from tgdsl.surfaces import meshlab
 from tgdsl.surfaces.region import Region
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 7, 50, 120, 500])
+@pytest.mark.parametrize("count", [1, 7, 120])
 def test_poisson_gives_the_exact_count_evenly_on_the_surface(count):
     radius = 0.01
     mesh = ball(radius)
-    found = sample(surface_of(mesh), placement("poisson", count=count), HERE)
-    assert found.pos.shape == (count, 3)
-    np.testing.assert_allclose(found.area.sum(), mesh.area, rtol=1e-9)
-    assert (found.area > 0).all()
-    np.testing.assert_array_equal(found.cell, np.full((count, 2), -1))
-    _, face = KDTree(mesh.triangles_center).query(found.pos, k=8)
-    height = ((found.pos[:, None] - mesh.triangles_center[face]) * mesh.face_normals[face]).sum(-1)
-    own = np.abs((found.normal[:, None] * mesh.face_normals[face]).sum(-1) - 1).argmin(axis=1)
+    samples = sample(surface_of(mesh), placement("poisson", count=count), HERE)
+    assert samples.pos.shape == (count, 3)
+    np.testing.assert_allclose(samples.area.sum(), mesh.area, rtol=1e-9)
+    assert (samples.area > 0).all()
+    np.testing.assert_array_equal(samples.cell, np.full((count, 2), -1))
+    _, face = KDTree(mesh.triangles_center).query(samples.pos, k=8)
+    height = ((samples.pos[:, None] - mesh.triangles_center[face]) * mesh.face_normals[face]).sum(-1)
+    own = np.abs((samples.normal[:, None] * mesh.face_normals[face]).sum(-1) - 1).argmin(axis=1)
     assert np.abs(height[np.arange(count), own]).max() < 1e-9  # in the plane of the face whose normal it has
     if count >= 50:
         ideal = np.sqrt(2 * mesh.area / (np.sqrt(3) * count))  # hexagonal packing
-        nearest = KDTree(found.pos).query(found.pos, k=2)[0][:, 1]
+        nearest = KDTree(samples.pos).query(samples.pos, k=2)[0][:, 1]
         assert nearest.min() > 0.7 * ideal
         random = np.random.default_rng(0).normal(size=(count, 3))
         random *= radius / np.linalg.norm(random, axis=1, keepdims=True)
         uniform = KDTree(random).query(random, k=2)[0][:, 1]
         assert nearest.mean() > 1.4 * uniform.mean()  # bluer: uniform points have 1/2√density
         assert nearest.std() / nearest.mean() < 0.12
-        assert found.area.std() / found.area.mean() < 0.25
+        assert samples.area.std() / samples.area.mean() < 0.25
 
 
 def test_poisson_is_the_same_bytes_each_time_and_differs_by_seed():
     def bytes_of(seed: int, **keys: object) -> bytes:
-        found = sample(surface_of(box((0.01, 0.02, 0.03))), placement("poisson", seed=seed, **keys), HERE)
-        return b"".join(getattr(found, name).tobytes() for name in ("pos", "normal", "tangent", "area"))
+        samples = sample(surface_of(box((0.01, 0.02, 0.03))), placement("poisson", seed=seed, **keys), HERE)
+        return b"".join(getattr(samples, name).tobytes() for name in ("pos", "normal", "tangent", "area"))
 
     for keys in ({"count": 40}, {"spacing": 0.003}):
         assert bytes_of(3, **keys) == bytes_of(3, **keys)
@@ -55,12 +55,12 @@ def test_poisson_is_the_same_bytes_each_time_and_differs_by_seed():
 @pytest.mark.parametrize("spacing", [0.002, 0.0051, 0.1])
 def test_spacing_is_kept_and_leaves_no_gap(spacing):
     surface = surface_of(box((0.02, 0.02, 0.01)))
-    found = sample(surface, placement("poisson", spacing=spacing), HERE)
-    if len(found.pos) > 1:
-        assert KDTree(found.pos).query(found.pos, k=2)[0][:, 1].min() >= spacing
+    samples = sample(surface, placement("poisson", spacing=spacing), HERE)
+    if len(samples.pos) > 1:
+        assert KDTree(samples.pos).query(samples.pos, k=2)[0][:, 1].min() >= spacing
     pool = poisson.pool(meshlab.outer_shell(surface), Region(None, (), (), ()), 0, None, spacing)
-    assert KDTree(found.pos).query(pool.pos)[0].max() <= spacing
-    np.testing.assert_allclose(found.area.sum(), 2 * (0.0004 + 0.0002 + 0.0002), rtol=1e-9)
+    assert KDTree(samples.pos).query(pool.pos)[0].max() <= spacing
+    np.testing.assert_allclose(samples.area.sum(), 2 * (0.0004 + 0.0002 + 0.0002), rtol=1e-9)
 
 
 @pytest.mark.parametrize("sign", [1, -1], ids=["outward", "inside_out"])
@@ -68,24 +68,24 @@ def test_poisson_leaves_out_an_inner_shell(sign):
     inner, outer = ball(0.005, (0.002, 0, 0)), ball(0.01)
     inner.faces, outer.faces = inner.faces[:, ::sign], outer.faces[:, ::-sign]
     for meshes in ((inner, outer), (outer, inner), (trimesh.util.concatenate([outer, inner]),)):
-        found = sample(surface_of(*meshes), placement("poisson", count=100), HERE)
-        assert np.linalg.norm(found.pos, axis=1).min() > 0.0098
-        assert ((found.normal * found.pos).sum(axis=1) > 0).all()
-        np.testing.assert_allclose(found.area.sum(), outer.area, rtol=1e-9)
+        samples = sample(surface_of(*meshes), placement("poisson", count=100), HERE)
+        assert np.linalg.norm(samples.pos, axis=1).min() > 0.0098
+        assert ((samples.normal * samples.pos).sum(axis=1) > 0).all()
+        np.testing.assert_allclose(samples.area.sum(), outer.area, rtol=1e-9)
 
 
 def test_poisson_samples_the_union_of_overlapping_boxes():
-    found = sample(surface_of(box((2, 2, 2)), box((2, 2, 2), (1, 1, 1))), placement("poisson", count=600), HERE)
+    samples = sample(surface_of(box((2, 2, 2)), box((2, 2, 2), (1, 1, 1))), placement("poisson", count=600), HERE)
     for corner in (np.zeros(3), np.ones(3)):
-        assert (np.abs(found.pos - corner).max(axis=1) > 1 - 1e-9).all()
-    np.testing.assert_allclose(found.area.sum(), 2 * 24 - 6, rtol=0.01)
+        assert (np.abs(samples.pos - corner).max(axis=1) > 1 - 1e-9).all()
+    np.testing.assert_allclose(samples.area.sum(), 2 * 24 - 6, rtol=0.01)
 
 
 @pytest.mark.parametrize(("shift", "size", "area"), [((2, 0, 0), (2, 2, 2), 40), ((1, 0, 0), (2, 2, 2), 32)])
 def test_poisson_counts_touching_and_flush_faces_as_the_union_does(shift, size, area):
-    found = sample(surface_of(box((2, 2, 2)), box(size, shift)), placement("poisson", count=300), HERE)
-    np.testing.assert_allclose(found.area.sum(), area, rtol=0.01)
-    assert KDTree(found.pos).query(found.pos, k=2)[0][:, 1].min() > 0.2
+    samples = sample(surface_of(box((2, 2, 2)), box(size, shift)), placement("poisson", count=300), HERE)
+    np.testing.assert_allclose(samples.area.sum(), area, rtol=0.01)
+    assert KDTree(samples.pos).query(samples.pos, k=2)[0][:, 1].min() > 0.2
 
 
 def test_poisson_leaves_out_a_pocket_behind_a_pinhole():
@@ -101,8 +101,8 @@ def test_poisson_leaves_out_a_pocket_behind_a_pinhole():
     mesh = trimesh.Trimesh(joined.vertices, faces + tunnel, process=False)
     assert mesh.is_watertight
     assert mesh.body_count == 1
-    found = sample(surface_of(mesh), placement("poisson", count=100), HERE)
-    assert (np.linalg.norm(found.pos, axis=1) < 0.0098).sum() <= 1
+    samples = sample(surface_of(mesh), placement("poisson", count=100), HERE)
+    assert (np.linalg.norm(samples.pos, axis=1) < 0.0098).sum() <= 1
 
 
 def test_components_are_closed_if_they_have_no_border():
@@ -116,32 +116,32 @@ def test_components_are_closed_if_they_have_no_border():
     assert meshlab.outer_shell(surface_of(turned)).is_closed.tolist() == [True]  # cleaning makes the windings agree
 
 
-def test_what_is_seen_is_outside_of_closed_meshes_without_winding_numbers(monkeypatch):
-    """A ball and, inside of it but for a cap, another: only points that the first directions do not see are asked for."""
-    asked, winding = list[int](), meshlab.Shell.winding
-    monkeypatch.setattr(meshlab.Shell, "winding", lambda own, i, pos: asked.append(len(pos)) or winding(own, i, pos))
+def test_visible_points_of_closed_meshes_need_no_winding_numbers(monkeypatch):
+    """A ball and, inside of it but for a cap, another: only points that the first directions do not see are num_asked for."""
+    num_asked, winding = list[int](), meshlab.Shell.winding
+    monkeypatch.setattr(meshlab.Shell, "winding", lambda own, i, pos: num_asked.append(len(pos)) or winding(own, i, pos))
     small = ball(0.005)
     small.apply_translation([0.01, 0, 0])
     surface = surface_of(trimesh.util.concatenate([ball(0.01), small]))
     shell = meshlab.outer_shell(surface)
-    asked.clear()
-    found = poisson.pool(shell, Region(None, (), (), ()), seed=0, count=1, spacing=None)
+    num_asked.clear()
+    samples = poisson.pool(shell, Region(None, (), (), ()), seed=0, count=1, spacing=None)
     # The circle in which they meet is at x = 8.75 mm: caps of 1.25 mm and of 3.75 mm are inside the other ball.
     outside = 2 * np.pi * (0.01 * 0.01875 + 0.005 * 0.00625)
-    assert found is not None and found.area == pytest.approx(outside, rel=0.01)
-    assert sum(asked) < 0.5 * len(found.pos)
+    assert samples is not None and samples.area == pytest.approx(outside, rel=0.01)
+    assert sum(num_asked) < 0.5 * len(samples.pos)
 
 
 def test_poisson_on_open_meshes():
     bowl = ball(0.01)
     bowl.update_faces(bowl.triangles_center[:, 2] > 0)
     marble = ball(0.002)
-    found = sample(surface_of(bowl, marble), placement("poisson", count=200), HERE)
-    assert (np.linalg.norm(found.pos, axis=1) < 0.0021).any()  # a bowl encloses nothing
-    np.testing.assert_allclose(found.area.sum(), bowl.area + marble.area, rtol=0.01)
+    samples = sample(surface_of(bowl, marble), placement("poisson", count=200), HERE)
+    assert (np.linalg.norm(samples.pos, axis=1) < 0.0021).any()  # a bowl encloses nothing
+    np.testing.assert_allclose(samples.area.sum(), bowl.area + marble.area, rtol=0.01)
     punctured = trimesh.Trimesh((shell := ball(0.01)).vertices, shell.faces[3:], process=False)
-    found = sample(surface_of(punctured, marble), placement("poisson", count=200), HERE)
-    assert np.linalg.norm(found.pos, axis=1).min() > 0.0098  # a few missing triangles do not make a bowl
+    samples = sample(surface_of(punctured, marble), placement("poisson", count=200), HERE)
+    assert np.linalg.norm(samples.pos, axis=1).min() > 0.0098  # a few missing triangles do not make a bowl
 
 
 def test_poisson_mends_windings_that_disagree():
@@ -149,15 +149,15 @@ def test_poisson_mends_windings_that_disagree():
     faces = mesh.faces.copy()
     faces[::2] = faces[::2, ::-1]
     mixed = trimesh.Trimesh(mesh.vertices, faces, process=False)
-    found = sample(surface_of(mixed), placement("poisson", count=80), HERE)
-    assert ((found.normal * found.pos).sum(axis=1) > 0).all()
+    samples = sample(surface_of(mixed), placement("poisson", count=80), HERE)
+    assert ((samples.normal * samples.pos).sum(axis=1) > 0).all()
 
 
 def test_poisson_densifies_for_a_small_region():
     region = {"sphere": {"center": [0.03, 0, 0.05], "radius": "0.5 mm"}}
-    found = sample(surface_of(box((0.1, 0.1, 0.1))), placement("poisson", count=300, region=region), HERE)
-    assert len(found.pos) == 300
-    np.testing.assert_allclose(found.area.sum(), np.pi * 0.0005**2, rtol=0.03)
+    samples = sample(surface_of(box((0.1, 0.1, 0.1))), placement("poisson", count=300, region=region), HERE)
+    assert len(samples.pos) == 300
+    np.testing.assert_allclose(samples.area.sum(), np.pi * 0.0005**2, rtol=0.03)
 
 
 def test_poisson_errors(monkeypatch):
@@ -181,15 +181,15 @@ import sys; sys.path[:0] = ["tests/helpers", "tests"]
 from oracles.setups.solids import box, surface_of
 from surfaces import HERE, placement
 from tgdsl.placement.sample.sample import sample
-found = sample(surface_of(box((0.01, 0.02, 0.03))), placement("poisson", count=40, sampler="pymeshlab"), HERE)
-sys.stdout.write((found.pos.tobytes() + found.normal.tobytes() + found.area.tobytes()).hex())
+samples = sample(surface_of(box((0.01, 0.02, 0.03))), placement("poisson", count=40, sampler="pymeshlab"), HERE)
+sys.stdout.write((samples.pos.tobytes() + samples.normal.tobytes() + samples.area.tobytes()).hex())
 """
 
 
 def test_pymeshlab_draws_the_same_bytes_in_every_process():
     def bytes_of(**keys: object) -> str:
-        found = sample(surface_of(box((0.01, 0.02, 0.03))), placement("poisson", count=40, **keys), HERE)
-        return (found.pos.tobytes() + found.normal.tobytes() + found.area.tobytes()).hex()
+        samples = sample(surface_of(box((0.01, 0.02, 0.03))), placement("poisson", count=40, **keys), HERE)
+        return (samples.pos.tobytes() + samples.normal.tobytes() + samples.area.tobytes()).hex()
 
     root = Path(__file__).parents[3]
     fresh = subprocess.run([sys.executable, "-c", PYMESHLAB], cwd=root, capture_output=True, text=True, check=True).stdout
@@ -202,19 +202,19 @@ def test_pymeshlab_draws_the_same_bytes_in_every_process():
 def test_pymeshlab_spreads_samples_evenly_over_the_region(keys):
     radius, region = 0.01, {"facing": [0, 0, 1], "within": "60 deg"}
     mesh = ball(radius, subdivisions=3)
-    found = sample(surface_of(mesh), placement("poisson", sampler="pymeshlab", region=region, **keys), HERE)
+    samples = sample(surface_of(mesh), placement("poisson", sampler="pymeshlab", region=region, **keys), HERE)
     is_in = mesh.face_normals[:, 2] >= 0.5
-    np.testing.assert_allclose(found.area.sum(), mesh.area_faces[is_in].sum(), rtol=1e-9)
+    np.testing.assert_allclose(samples.area.sum(), mesh.area_faces[is_in].sum(), rtol=1e-9)
     triangles = mesh.triangles[is_in]
-    from_plane = ((found.pos[:, None] - triangles[:, 0]) * mesh.face_normals[is_in]).sum(axis=2)
-    of_normal = np.linalg.norm(found.normal[:, None] - mesh.face_normals[is_in], axis=2).argmin(axis=1)
-    assert np.abs(from_plane[np.arange(len(found.pos)), of_normal]).max() < 1e-9  # on the face whose normal it has
-    nearest = KDTree(found.pos).query(found.pos, k=2)[0][:, 1]
+    from_plane = ((samples.pos[:, None] - triangles[:, 0]) * mesh.face_normals[is_in]).sum(axis=2)
+    of_normal = np.linalg.norm(samples.normal[:, None] - mesh.face_normals[is_in], axis=2).argmin(axis=1)
+    assert np.abs(from_plane[np.arange(len(samples.pos)), of_normal]).max() < 1e-9  # on the face whose normal it has
+    nearest = KDTree(samples.pos).query(samples.pos, k=2)[0][:, 1]
     if "count" in keys:
-        assert len(found.pos) == keys["count"]
-        ideal = np.sqrt(2 * found.area.sum() / (np.sqrt(3) * keys["count"]))  # hexagonal packing
+        assert len(samples.pos) == keys["count"]
+        ideal = np.sqrt(2 * samples.area.sum() / (np.sqrt(3) * keys["count"]))  # hexagonal packing
         assert nearest.min() > 0.6 * ideal and nearest.std() / nearest.mean() < 0.12
     else:
         assert nearest.min() >= keys["spacing"]
-        gaps = KDTree(found.pos).query(triangles.mean(axis=1))[0]
+        gaps = KDTree(samples.pos).query(triangles.mean(axis=1))[0]
         assert gaps.max() <= 1.05 * keys["spacing"]  # as large as the pool's points lie apart
