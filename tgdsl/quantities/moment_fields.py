@@ -261,10 +261,7 @@ def _node_sums(
     values = np.zeros((len(index), channels))
     bricks = np.asarray(np.ravel_multi_index(tuple((index // BRICK).T), tuple(n // BRICK + 1 for n in num)))
     order = np.argsort(bricks, kind="stable")
-    near = surface.tree.query(origin + cell * index[order], distance_upper_bound=radius)[0] < np.inf
-    order = order[near]
-    ends = 1 + np.flatnonzero(np.diff(bricks[order]))
-    for nodes in np.split(order, ends) if len(order) else []:
+    for nodes in np.split(order, 1 + np.flatnonzero(np.diff(bricks[order]))):
         values[nodes] = moment_sums(surface, origin + cell * index[nodes], radius, channels, len(nodes))
     return values.reshape(*num, channels)
 
