@@ -321,7 +321,9 @@ def test_blocks_are_tiles_where_a_taxel_asks_for_little(document, name):
 
 
 def test_the_number_of_environments_is_the_only_size_that_a_compiled_module_does_not_know(document):
-    document["sensors"] = {"mine": {"links": "pad", "feels": ["item"], "kind": "force_taxel", "noise": {"read_delay": "5 ms"}}}
+    document["sensors"] = {
+        "mine": {"links": "pad", "feels": ["item"], "kind": "contact_depth", "noise": {"read_delay": "5 ms"}}
+    }
     touch, unknown = tgdsl.compile(document), []
 
     def keep(graph, inputs):

@@ -147,18 +147,19 @@ def test_pause_stops_and_step_once_makes_one_step(document):
         assert page.stage.time == pytest.approx(page.stage.control_step)
 
 
-def recorded(document: Path, folder: Path) -> Path:
+@pytest.fixture(scope="module")
+def recording(document, tmp_path_factory) -> Path:
     from tgdsl.commands.documents import Run
 
+    folder = tmp_path_factory.mktemp("run")
     Run(document, keyframes=("up",), seconds=0.3, out=folder).run()
     return folder / "readings.npz"
 
 
-def test_a_recorded_run_is_where_mujoco_had_it(document, tmp_path):
-    path = recorded(document, tmp_path)
+def test_a_recorded_run_is_where_mujoco_had_it(document, recording):
     touch = tgdsl.compile(document)
-    stage = RunStage(touch, path)
-    with np.load(path) as arrays:
+    stage = RunStage(touch, recording)
+    with np.load(recording) as arrays:
         qpos, readings = arrays["qpos"], arrays["touch"]
     model = mujoco.MjModel.from_xml_string(SCENE)
     data = mujoco.MjData(model)
@@ -180,12 +181,11 @@ def test_a_recorded_run_is_where_mujoco_had_it(document, tmp_path):
         assert page.panel.instant.value == 3
 
 
-def test_a_run_of_another_document_is_refused_by_name(document, tmp_path):
-    path = recorded(document, tmp_path)
+def test_a_run_of_another_document_is_refused_by_name(document, recording):
     other = document.with_name("other.yaml")
     other.write_text(DOCUMENT.replace("near:", "close:"))
     with pytest.raises(SimulationError, match=r'no reading "close"'):
-        RunStage(tgdsl.compile(other), path)
+        RunStage(tgdsl.compile(other), recording)
 
 
 def test_what_is_no_run_is_refused_with_what_it_lacks(tmp_path):
@@ -529,6 +529,17 @@ def test_a_task_is_moved_by_its_policy_or_by_hand():
         assert "object_distance" in page.panel.notes.content
 
 
+@pytest.mark.slow
+def test_a_policy_moves_a_task():
+    policy = ROOT / "policies/in_palm_rotate_cube.pt"
+    with opened(View(ROOT / "examples/tasks/in_palm_rotate_cube.yaml", policy=policy, envs=2)._stage()) as page:
+        page.stage.advance()
+        page.draw()
+        assert (page.stage.acted(1) != 0).any()
+        assert len(page.scene.layers[0].rows.body) == 199
+        assert "object_distance" in page.panel.notes.content
+
+
 # Hands -------------------------------------------------------------------------------------------------------------------------
 
 
@@ -787,45 +798,17 @@ def test_a_browser_shows_a_document_and_its_controls_act(browser, document):
 
 @pytest.mark.browser
 @pytest.mark.slow
-def test_a_browser_shows_a_run_and_scrubs_it(browser, document, tmp_path):
-    with serving(View(recorded(document, tmp_path))) as page:
+def test_a_browser_shows_a_run_and_scrubs_it(browser, recording):
+    with serving(View(recording)) as page:
         view = open_page(browser, page)
         with at_rest(page):
             assert soon(lambda: is_drawn(view))
         field_of(view, "pause").dispatch_event("click")
         assert soon(lambda: page.panel.paused.value)
         write(view, "step", "2")
-        with np.load(tmp_path / "readings.npz") as arrays:
+        with np.load(recording) as arrays:
             time_then = arrays["time"][2]
         view.get_by_text(f"t = {time_then:.2f} s").wait_for()
-        view.close()
-
-
-@pytest.mark.browser
-@pytest.mark.slow
-def test_a_browser_shows_a_task_with_its_policy_and_reward_terms(browser):
-    task, policy = ROOT / "examples/tasks/in_palm_rotate_cube.yaml", ROOT / "policies/in_palm_rotate_cube.pt"
-    with serving(View(task, policy=policy, envs=2)) as page:
-        view = open_page(browser, page)
-        with at_rest(page):
-            assert soon(lambda: is_drawn(view))
-        view.get_by_text("object_distance").first.wait_for()
-        assert view.get_by_text("199 taxels").count() > 0
-        view.close()
-
-
-@pytest.mark.browser
-@pytest.mark.slow
-def test_a_browser_shows_the_log_of_a_hand_and_scrubs_it(browser, tmp_path):
-    path, _, _ = hand_log(tmp_path / "log.npz")
-    with serving(View(path)) as page:
-        view = open_page(browser, page)
-        with at_rest(page):
-            assert soon(lambda: is_drawn(view))
-        field_of(view, "pause").dispatch_event("click")
-        assert soon(lambda: page.panel.paused.value)
-        write(view, "step", "2")
-        view.get_by_text("then no reading").wait_for()
         view.close()
 
 

@@ -35,8 +35,7 @@ def assert_same(sim, env, other, env_there, fields) -> None:
 
 
 @pytest.mark.slow
-@BOTH
-@pytest.mark.parametrize("substeps", [1, 4])
+@pytest.mark.parametrize(("simulator", "substeps"), [(BatchSimulation, 1), (BatchSimulation, 4), (warp, 4)])
 def test_an_environment_that_diverges_is_started_anew_and_the_others_go_on(tmp_path, simulator, substeps):
     touch, keys = module(tmp_path), {"keyframe": "home", "substeps": substeps}
     sim, twin = simulator(touch, 4, on_fault="reset", **keys), simulator(touch, 4, **keys)

@@ -34,8 +34,11 @@ from tgdsl.runtime.batch.simulation import BatchSimulation
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("which", MODELS)
-@pytest.mark.parametrize("name", ['name="skin"', ""], ids=["named", "unnamed"])
+@pytest.mark.parametrize(
+    ("which", "name"),
+    [("mujoco", 'name="skin"'), ("mujoco", ""), ("warp", "")],
+    ids=["mujoco-named", "mujoco-unnamed", "warp-unnamed"],
+)
 def test_what_rests_on_a_welded_child_presses_the_link(tmp_path, which, name):
     """A box of 0.3 kg on the skin of a pad: every kind that reads forces reads its weight, every gate is open."""
     touch = compiled(tmp_path, ON_SKIN, ITEMS, of_kinds(["item"]) | GATED, pad=SKIN.format(name=name))

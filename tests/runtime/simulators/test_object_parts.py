@@ -202,8 +202,11 @@ def test_a_sensor_that_does_not_say_how_far_is_refused(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("which", MODELS)
-@pytest.mark.parametrize("name", ['name="handle"', ""], ids=["named", "unnamed"])
+@pytest.mark.parametrize(
+    ("which", "name"),
+    [("mujoco", 'name="handle"'), ("mujoco", ""), ("warp", "")],
+    ids=["mujoco-named", "mujoco-unnamed", "warp-unnamed"],
+)
 def test_what_is_welded_to_an_objects_body_is_part_of_it(tmp_path, which, name):
     """A mug that stands on its handle, a body without joint: depth, distance, contacts and force are those of the handle."""
     sensors = {

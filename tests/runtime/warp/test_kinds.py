@@ -68,7 +68,7 @@ def test_every_kind_reads_the_same_from_both(plan):
         np.random.default_rng(0).normal(size=(4, 6)) * [0.05, 0.05, 0.02, 0.3, 0.3, 0.5]
     )
     kept = []
-    for _ in range(30):
+    for _ in range(12):
         hand_over(sim, cpu)
         sim.step()
         cpu.step()
@@ -87,16 +87,19 @@ def test_every_kind_reads_the_same_from_both(plan):
 
 @pytest.mark.slow
 def test_two_hundred_steps_of_a_cube_at_rest(plan):
-    """The taxels of `force_taxel` carry its weight, and every reading is the CPU's to 0.1 %."""
-    readings = []
+    """The taxels of `force_taxel` carry its weight, every reading is the CPU's to 0.1 %, and the cube is as deep in the table."""
+    readings, heights = [], []
     for own in (warp, BatchSimulation):
         touch = TactileModule(plan)
         sim = own(touch, 2)
         kept = []
+        heights.append([])
         for i in range(200):
             sim.step()
             if i >= 150:
-                read = touch(sim.state())
+                state = sim.state()
+                read = touch(state)
+                heights[-1].append(state.body_pos[:, touch.inputs.bodies.index("cube"), 2].double())
                 kept.append({name: value.double().abs().mean() for name, value in read.items()})
         readings.append({name: torch.stack([one[name] for one in kept]).mean() for name in kept[0]})
         total = read["force"][..., :3].double().sum(dim=1)
@@ -104,3 +107,4 @@ def test_two_hundred_steps_of_a_cube_at_rest(plan):
         torch.testing.assert_close(total, expected, atol=1e-3, rtol=0)
     for name in KINDS:
         torch.testing.assert_close(readings[0][name], readings[1][name], rtol=1e-3, atol=1e-9, msg=name)
+    assert float(torch.stack(heights[0]).mean()) == pytest.approx(float(torch.stack(heights[1]).mean()), abs=1e-7)

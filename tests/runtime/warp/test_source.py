@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import pytest
 import torch
-from warp_cases import SCENE, WEIGHT, module, warp
+from warp_cases import SCENE, module, warp
 
 import tgdsl
 from tgdsl.errors import SimulationError
@@ -199,31 +199,3 @@ def test_models_of_environments_have_the_objects_that_are_there(tmp_path):
         for i in range(2):
             assert (models[0].geom(f"tgdsl/cube/{i}").rgba[3] > 0) == (number == i)
         assert [int(sim.state().variant[env, 0]) for sim in sims] == [number, number]
-
-
-# a run of 200 steps
-
-
-def weighed(sim, touch) -> tuple[float, float]:
-    """Return the mean force on the table [N] and the cube's height [m] over the last 50 of 200 control steps."""
-    pair = [(pair.link, pair.object) for pair in touch.inputs.pairs].index(("table", "cube"))
-    forces, heights = [], []
-    for i in range(200):
-        sim.step()
-        if i >= 150:
-            state = sim.state()
-            forces.append(float(state.contact_netforce[:, pair, 2].mean()))
-            heights.append(float(state.body_pos[:, touch.inputs.bodies.index("cube"), 2].mean()))
-    return float(np.mean(forces)), float(np.mean(heights))
-
-
-@pytest.mark.slow
-def test_two_hundred_steps_of_a_resting_cube(tmp_path):
-    """Newton: it presses with its weight; and it lies as deep as on the CPU."""
-    touch = module(tmp_path, PRESSED, links=("table",), kind="link_contact")
-    (force, height), (expected_force, expected_height) = (
-        weighed(sim, touch) for sim in (warp(touch, 2), BatchSimulation(touch, 2))
-    )
-    assert force == pytest.approx(-WEIGHT, rel=1e-4)
-    assert expected_force == pytest.approx(-WEIGHT, rel=1e-5)
-    assert height == pytest.approx(expected_height, abs=1e-7)
