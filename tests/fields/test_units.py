@@ -6,7 +6,7 @@ from typing import Annotated
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
@@ -137,6 +137,7 @@ def test_what_is_no_quantity(value, dimension, message):
     st.one_of(st.text(), st.from_regex(units._QUANTITY), st.none(), st.booleans(), st.integers(), st.floats()),
     st.sampled_from(DIMENSIONS),
 )
+@settings(max_examples=30)
 def test_anything_is_a_finite_float_or_a_value_error(value, dimension):
     try:
         found = units.parse(value, dimension)

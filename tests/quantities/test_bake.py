@@ -17,6 +17,7 @@ from tgdsl.surfaces.outer import OPEN
 from tgdsl.surfaces.surface import Surface
 
 MARGIN, TOLERANCE = 0.004, 2e-4
+COARSE = 1e-3
 SLACK = 1.15
 """On the tolerance, for a percentile of as few points as here."""
 
@@ -197,10 +198,10 @@ def test_a_finer_tolerance_takes_more_bytes_and_has_smaller_errors():
 
 def test_the_cache_gives_the_same_bytes_without_the_work(calls, cache):
     surface = surface_of(box((0.02, 0.02, 0.02)))
-    first = bake(surface, MARGIN, TOLERANCE)
+    first = bake(surface, MARGIN, COARSE)
     assert calls and len(list(cache.iterdir())) == 1
     calls.clear()
-    second = bake(surface, MARGIN, TOLERANCE)
+    second = bake(surface, MARGIN, COARSE)
     assert not calls
     assert first.values.tobytes() == second.values.tobytes() and first.origin.tobytes() == second.origin.tobytes()
     assert (first.cell, first.method, first.errors, first.flaws) == (
@@ -209,29 +210,29 @@ def test_the_cache_gives_the_same_bytes_without_the_work(calls, cache):
         second.errors,
         second.flaws,
     )
-    bake(surface, MARGIN, 2 * TOLERANCE)
+    bake(surface, MARGIN, 2 * COARSE)
     assert calls and len(list(cache.iterdir())) == 2
 
 
 @pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 nothing", None])
 def test_a_damaged_cache_file_is_rewritten(damage, calls, cache):
     surface = surface_of(box((0.02, 0.02, 0.02)))
-    first = bake(surface, MARGIN, TOLERANCE)
+    first = bake(surface, MARGIN, COARSE)
     (file,) = cache.iterdir()
     whole = file.read_bytes()
     file.write_bytes(whole[: len(whole) // 2] if damage is None else damage)
     calls.clear()
-    assert bake(surface, MARGIN, TOLERANCE).values.tobytes() == first.values.tobytes()
+    assert bake(surface, MARGIN, COARSE).values.tobytes() == first.values.tobytes()
     assert calls
     calls.clear()
-    bake(surface, MARGIN, TOLERANCE)
+    bake(surface, MARGIN, COARSE)
     assert not calls and list(cache.iterdir()) == [file]
 
 
 def test_without_a_writable_cache_it_works(monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("TGDSL_CACHE", str(tmp_path / "file" / "below"))
-    assert bake(surface_of(box((0.02, 0.02, 0.02))), MARGIN, TOLERANCE).errors.p99 <= TOLERANCE
+    assert bake(surface_of(box((0.02, 0.02, 0.02))), MARGIN, COARSE).errors.p99 <= COARSE
 
 
 def test_where_the_cache_is(monkeypatch):
@@ -249,7 +250,7 @@ def test_the_same_every_time(monkeypatch, tmp_path):
     found = []
     for name in "ab":
         monkeypatch.setenv("TGDSL_CACHE", str(tmp_path / name))
-        found.append(bake(surface_of(rounded_cube()), MARGIN, 4e-4))
+        found.append(bake(surface_of(ball(0.02, subdivisions=3)), MARGIN, 4e-4))
     assert found[0].values.tobytes() == found[1].values.tobytes() and found[0].errors == found[1].errors
 
 

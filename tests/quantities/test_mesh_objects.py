@@ -15,8 +15,8 @@ TOLERANCE = 5e-5
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path_factory.mktemp("cache")))
+def shared_cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
 
 
 L_SHAPE = trimesh.util.concatenate(

@@ -1,6 +1,7 @@
 """The Triton kernel of patches, run on the CPU by Triton's interpreter, against the torch code in float64."""
 
 import contact_patches
+import pytest
 import torch
 from kernels import interpreted, needs_triton, use_kernels
 
@@ -50,6 +51,7 @@ def compare() -> None:
     check_strange_numbers()
 
 
+@pytest.mark.slow
 @needs_triton
 def test_the_kernel_is_the_torch_code():
     interpreted(__file__)
