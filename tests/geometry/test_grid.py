@@ -101,7 +101,7 @@ def test_where_the_gradient_vanishes_it_is_a_fixed_unit_vector(method):
 @pytest.mark.parametrize("method", METHODS)
 def test_gradient_is_the_derivative(method, rough):
     """Inside, across the border and outside; trilinear not at faces of cells, where its gradient jumps."""
-    points = np.concatenate([points_in(15), points_in(15, seed=1) * 3 - 0.02])
+    points = np.concatenate([points_in(10), points_in(10, seed=1) * 3 - 0.02])
     p = torch.tensor(points, requires_grad=True)
 
     def distance(p: torch.Tensor) -> torch.Tensor:
@@ -118,7 +118,7 @@ def test_tricubic_gradient_is_continuous_at_faces_of_cells(rough):
     points = nodes + np.random.default_rng(0).uniform(0, CELL, nodes.shape) * [0, 1, 1]
     sides = [ask("tricubic", rough, points + [side * 1e-12, 0, 0])[1] for side in (-1, 1)]
     np.testing.assert_allclose(*sides, atol=1e-6)
-    p = torch.tensor(points, requires_grad=True)
+    p = torch.tensor(points[::3], requires_grad=True)
     assert torch.autograd.gradcheck(lambda p: tricubic(tuple(p.unbind(-1)), rough)[0], p, eps=1e-9, atol=1e-4)
 
 

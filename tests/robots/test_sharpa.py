@@ -201,12 +201,17 @@ def test_counts_are_the_papers(document, resolution):
     np.testing.assert_allclose((layout.normal * layout.tangent).sum(axis=1), 0, atol=1e-12)
 
 
+@pytest.fixture(scope="module")
+def high(document):
+    """Return the plan at the finest resolution."""
+    return compile_document(document, {"resolution": "high"}).plan
+
+
 @pytest.mark.slow
-def test_taxels_lie_on_the_surfaces_and_near_what_collides(document):
+def test_taxels_lie_on_the_surfaces_and_near_what_collides(high):
     """MuJoCo collides convex hulls: they may leave out a little of a pad, and only the palm's hollow is spanned by one."""
-    plan = compile_document(document, {"resolution": "high"}).plan
-    layout, robot = plan.layout, load_model(MODEL)
-    for i, link in enumerate(plan.layout.links):
+    layout, robot = high.layout, load_model(MODEL)
+    for i, link in enumerate(layout.links):
         pos = layout.pos[layout.link_id == i]
         geoms = robot.touchable(link.body)
         surface = robot.surface(geoms)
@@ -225,14 +230,13 @@ def test_taxels_lie_on_the_surfaces_and_near_what_collides(document):
 
 
 @pytest.mark.slow
-def test_pads_face_away_from_the_bone(document):
+def test_pads_face_away_from_the_bone(high):
     """In the straight hand all fingers' taxels look out of the palm, as the palm's own do; a thumb's look along its pad."""
-    plan = compile_document(document, {"resolution": "high"}).plan
-    layout, hand = plan.layout, mujoco.MjModel.from_xml_path(str(MODEL))
+    layout, hand = high.layout, mujoco.MjModel.from_xml_path(str(MODEL))
     data = mujoco.MjData(hand)
     mujoco.mj_forward(hand, data)
     thumb = data.body("right_thumb_DP").xmat.reshape(3, 3)[:, 1]
-    for i, link in enumerate(plan.layout.links):
+    for i, link in enumerate(layout.links):
         chosen = layout.link_id == i
         normal = layout.normal[chosen] @ data.body(link.body).xmat.reshape(3, 3).T
         outward = thumb if "thumb" in link.name else np.array([1.0, 0.0, 0.0])

@@ -38,7 +38,7 @@ SHARPA_SCENE = f"""
 """
 FULL_SCALE = 1e-6
 """Largest difference of a reading, of the largest of the run. Joint frames in float32 alone would make 1.5e-6."""
-STEPS, HOLD, RAMP = 500, 100, 250
+STEPS, HOLD, RAMP = 150, 10, 120
 """Control steps of 2 ms in all, before the squeeze, and from its start to its end."""
 
 # Scenes hold keyframes, lights and the like, which USD does not: the exporter says so.
@@ -130,7 +130,7 @@ def colliding_pairs(model) -> set[tuple[int, int]]:
     return {(a, b) for a, b in pairs if not (is_filtering and is_family(a, b))}
 
 
-@pytest.mark.parametrize(("hand", "resolution"), [("xhand1", "med"), pytest.param("sharpa", "high", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("hand", "resolution"), [("xhand1", "low"), pytest.param("sharpa", "high", marks=pytest.mark.slow)])
 def test_layouts_are_the_same(hand, resolution):
     """The palm is what is felt: any object would do."""
     files = [ROOT / "robots" / hand / f"{hand}_right{ending}" for ending in (".xml", ".usda")]
@@ -161,13 +161,11 @@ def test_a_squeeze_reads_the_same(hand, tmp_path):
 @pytest.mark.filterwarnings("ignore:.*collides the convex hull", "ignore::tgdsl.errors.UnfeltWarning")  # its own palm is felt
 def test_an_artefact_of_a_usd_robot_is_kept_and_run(tmp_path):
     model = ROOT / "robots" / "xhand1" / "xhand1_right.usda"
-    for name in ("first", "second"):
-        touch = tgdsl.compile(document(model, "xhand1", "low", HANDS["xhand1"]))
-        tgdsl.save(touch, tmp_path / name)
-    assert (tmp_path / "first").read_bytes() == (tmp_path / "second").read_bytes()
+    touch = tgdsl.compile(document(model, "xhand1", "low", HANDS["xhand1"]))
+    tgdsl.save(touch, tmp_path / "touch.safetensors")
     readings = []
-    for own in (touch, tgdsl.load(tmp_path / "first")):
-        sim = tgdsl.simulate(own, 1)
+    for module in (touch, tgdsl.load(tmp_path / "touch.safetensors")):
+        sim = tgdsl.simulate(module, 1)
         sim.step(np.full(12, 0.5))
-        readings.append(own(sim.state())["depth"].numpy().copy())
+        readings.append(module(sim.state())["depth"].numpy().copy())
     np.testing.assert_array_equal(*readings)
