@@ -6,8 +6,8 @@
 
 A change is a sign, an operator, a comparison, a number, an index, a swapped name or a dropped statement. Each runs in a fork of
 a process that has the libraries imported, with the changed module in place of the real one; the files stay as they are. The
-tests that reach the changed line are known from one run of `make test` under coverage, which is kept in `build/mutate` and
-made again with `--refresh`; tests that fail then are left out. A change is killed when a test fails or hangs. What survives
+tests that reach the changed line are known from one run of `make test` and the oracles under coverage. It is kept in
+`build/mutate` and made again with `--refresh`; tests that fail then are left out. A change is killed when a test fails or hangs. What survives
 `--limit` seconds of tests, near and short ones first, is given ten times as many.
 
 A survivor means one of three things: a test is missing, the code has no effect and can go, or the change is equivalent.
@@ -351,7 +351,7 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=60.0, help="seconds of tests per change")
     parser.add_argument("--least", type=float, default=0.0, help="least share of killed changes")
     parser.add_argument("--refresh", action="store_true", help="record again which test reaches which line")
-    parser.add_argument("--tests", nargs="+", default=["-m", "not slow"], help="arguments of pytest for the record")
+    parser.add_argument("--tests", nargs="+", default=["-m", "not slow or oracle"], help="arguments of pytest for the record")
     options = parser.parse_args()
     os.chdir(REPOSITORY)
     os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -10,8 +10,6 @@ from oracles.hard.case import HARD, Allowed, HardCase
 from tgdsl.errors import TgdslError
 from tgdsl.sensors import KINDS
 
-ALL = [pytest.param(case, id=case.name, marks=[pytest.mark.slow] if case.is_slow else []) for case in CASES]
-
 
 def assert_holds(comparison: Comparison) -> None:
     """Assert that each number is as near to its exact value as the comparison allows."""
@@ -37,7 +35,9 @@ def cache(tmp_path_factory):
     return tmp_path_factory.mktemp("cache")
 
 
-@pytest.mark.parametrize("case", ALL)
+@pytest.mark.slow
+@pytest.mark.oracle
+@pytest.mark.parametrize("case", [pytest.param(case, id=case.name) for case in CASES])
 def test_it_holds(case, cache, monkeypatch):
     """Modes are analysed here, whatever a cache has of them."""
     if case.section == "sound: modes of bodies":
@@ -45,6 +45,8 @@ def test_it_holds(case, cache, monkeypatch):
     assert_holds(case.compute())
 
 
+@pytest.mark.slow
+@pytest.mark.oracle
 @pytest.mark.parametrize("case", [pytest.param(case, id=case.name) for case in HARD])
 def test_hard_cases_stand(case):
     assert_stands(case.compute())
