@@ -61,24 +61,20 @@ def rms(found, exact):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("accuracy", "bound"), [("10 %", 0.1), ("1 %", 0.01), ("0.01 %", 1e-4)])
-def test_the_accuracy_is_held_on_states_that_took_no_part(tmp_path, others, accuracy, bound):
-    """And the next coarser grid, which takes fewer operations or bytes, does not hold it there."""
+def test_the_coarsest_variant_is_chosen_that_holds_the_accuracy_on_other_states(tmp_path, others):
+    """The next coarser grid, which takes fewer operations or bytes, does not hold it there; each accuracy has another variant."""
     states, exact = others
-    made = chosen_document(tmp_path, depth_at(accuracy))
-    assert rms(read(tgdsl.compile(made), states), exact) <= bound
-    chosen = choose(made).changes
-    is_grid = chosen[KEYS[0]] == "sdf"
-    place = GRIDS.index(chosen[KEYS[1]]) if is_grid else len(GRIDS)
-    if place:
-        bare = {"sensors.depth.accuracy": None, KEYS[1]: GRIDS[place - 1]}
-        assert rms(read(tgdsl.compile(made, overrides=bare), states), exact) > bound
-
-
-@pytest.mark.slow
-def test_each_accuracy_has_a_variant_of_its_own(tmp_path):
-    found = [str(choose(chosen_document(tmp_path, depth_at(own))).changes) for own in ("10 %", "1 %", "0.01 %")]
-    assert len(set(found)) == 3
+    variants = set()
+    for accuracy, bound in (("10 %", 0.1), ("1 %", 0.01), ("0.01 %", 1e-4)):
+        document = chosen_document(tmp_path, depth_at(accuracy))
+        assert rms(read(tgdsl.compile(document), states), exact) <= bound
+        changes = choose(document).changes
+        variants.add(str(changes))
+        place = GRIDS.index(changes[KEYS[1]]) if changes[KEYS[0]] == "sdf" else len(GRIDS)
+        if place:
+            coarser = {"sensors.depth.accuracy": None, KEYS[1]: GRIDS[place - 1]}
+            assert rms(read(tgdsl.compile(document, overrides=coarser), states), exact) > bound
+    assert len(variants) == 3
 
 
 @pytest.mark.slow
@@ -105,7 +101,6 @@ def test_sensors_without_an_accuracy_keep_what_they_have(tmp_path):
     """What nobody wrote is 0.05 mm."""
     plain = "plain: {kind: contact_depth, gate: geometric}"
     assert choose(chosen_document(tmp_path, depth_at("10 %"), plain)).changes[KEYS[1]] == 5e-5
-    assert choose(chosen_document(tmp_path, depth_at("0.01 %"), plain)).changes == {KEYS[0]: "raycast"}
     alone = choose(chosen_document(tmp_path, depth_at("10 %"), plain), sensors=["depth"])
     assert alone.changes[KEYS[1]] == 1e-3
 
@@ -116,9 +111,7 @@ def test_what_is_written_stays(tmp_path):
     assert choose(made).changes == {}
     assert "left as written: objects.stone.tolerance" in tgdsl.compile(made).explain()
     made = chosen_document(tmp_path, depth_at("10 %"))
-    assert choose(made, {KEYS[1]: "0.02 mm"}).changes == {}
     assert choose(made, {KEYS[0]: "sdf"}).changes[KEYS[1]] == 1e-3
-    assert choose(made, {KEYS[0]: "raycast"}).changes == {KEYS[0]: "raycast"}
 
 
 @pytest.mark.slow
@@ -151,12 +144,12 @@ def forget_choices():
 
 @pytest.mark.slow
 def test_the_same_document_gives_the_same_bytes(tmp_path, monkeypatch):
-    """With what is kept, and without."""
+    """With the choice in the cache, and without."""
     made, found = chosen_document(tmp_path, depth_at("1 %")), []
     for name in ("one", "two", "three"):
-        if name != "three":
+        if name == "two":
             forget_choices()
-        else:
+        elif name == "three":
             monkeypatch.setattr(choosing, "record", None)  # nothing is run again
         save_plan(compile_plan(made), tmp_path / f"{name}.safetensors")
         found.append((tmp_path / f"{name}.safetensors").read_bytes())
