@@ -60,7 +60,7 @@ def test_one_state_gives_the_readings_of_the_cpu(tmp_path):
     sim.warp_model.opt.tolerance.fill_(model.opt.tolerance)  # mujoco_warp's own is 100 times MuJoCo's
     pushed(sim, 0)
     num_found = 0
-    for i in range(40):
+    for i in range(20):
         hand_over(sim, cpu)
         control = np.random.default_rng(i).normal(size=(6, 2))
         sim.step(control)
@@ -71,7 +71,7 @@ def test_one_state_gives_the_readings_of_the_cpu(tmp_path):
         scale = expected.abs().amax((0, 1)) + 1e-12
         assert ((found - expected).abs().amax((0, 1)) <= TOLERANCE * scale).all()
         num_found += int((expected != 0).any())
-    assert num_found > 20
+    assert num_found > 10
 
 
 def test_poses_and_contacts_are_those_at_the_start_of_the_last_substep(tmp_path):
@@ -148,7 +148,7 @@ def test_work_is_captured_at_its_third_call_and_then_replayed():
 
 @pytest.mark.slow
 def test_a_cube_at_rest_and_squeezed_fares_as_on_the_cpu():
-    """200 control steps of their own on either side: 1,000 physics steps from float32 and from float64."""
+    """100 control steps on either side: 500 physics steps from float32 and from float64."""
     touch = tgdsl.compile(Path(__file__).parents[3] / "examples" / "xhand1_palm.yaml")
     keys = {"substeps": 5, "keyframe": "rest"}
     modules = touch, copy.deepcopy(touch)
@@ -156,10 +156,10 @@ def test_a_cube_at_rest_and_squeezed_fares_as_on_the_cpu():
     rest, squeeze = (sims[0].model.key(name).ctrl for name in ("rest", "squeeze"))
     strength, cube = np.array([[0.0], [0.8], [1.0], [1.1]]), touch.inputs.bodies.index("cube")
     forces, heights = ([[], []] for _ in range(2))
-    for i in range(200):
+    for i in range(100):
         for which, sim in enumerate(sims):
-            sim.step(rest + (squeeze - rest) * strength * min(1.0, i / 100))
-            if i >= 150:
+            sim.step(rest + (squeeze - rest) * strength * min(1.0, i / 50))
+            if i >= 75:
                 state = sim.state()
                 forces[which].append(modules[which](state)["touch"][..., :3].norm(dim=-1).sum(dim=1))
                 heights[which].append(state.body_pos[:, cube, 2].double())
