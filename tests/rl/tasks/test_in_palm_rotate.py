@@ -20,6 +20,8 @@ MORE = "episode: 0.5 s\nmax_force: 0.05 N\nfree_distance: 1 mm\ndrop_distance: 2
 MORE += "free_speed: 1 mm/s\nfree_spin: 0.1\n"
 COSTS = {"rewards.effort": -0.5, "rewards.object_speed": -0.2}
 """Weights that are 0 by default, so that all terms are seen."""
+WEIGHTS = {name: (1.5 + 0.1 * i) * value or -0.5 for i, (name, value) in enumerate(InPalmRotate.Rewards())}
+"""Weights that are not those of the task, each by another factor."""
 
 
 def held_reference(env):
@@ -37,7 +39,9 @@ def random_actions(env, num, seed=0):
 @pytest.mark.parametrize("direction", ["counterclockwise", "clockwise"])
 def test_rewards_ends_and_scores_equal_the_reference(tmp_path, direction):
     push = "randomise: {xy: [-5 mm, 5 mm], yaw: [-1, 1], push: {x: [-2 N, 2 N], interval: [0.1 s, 0.2 s]}}\n"
-    env = tiny_env(tmp_path, 4, more=MORE + push + f"direction: {direction}\n", overrides=COSTS | {"hold.coasting_pay": 0.25})
+    env = tiny_env(
+        tmp_path, 4, more=MORE + push + f"direction: {direction}\n", overrides={"rewards": WEIGHTS, "hold.coasting_pay": 0.25}
+    )
     recorder = Recorder(env)
     for i, action in enumerate(random_actions(env, 80)):
         env.sim.qvel[:2, 8] = 6.0 if direction == "counterclockwise" else -6.0  # spun by hand: nothing else turns a ball
@@ -131,7 +135,7 @@ def test_goals_are_quarter_turns(tmp_path, direction, way):
     obs = env.reset()
     assert obs["goal"][0].tolist() == pytest.approx([0, way, 0, -way, 0, 0, math.pi / 2], abs=1e-6)
     reached = []
-    for i in range(1, 140):
+    for i in range(1, 70):
         angle = torch.tensor(way * 0.05 * i, dtype=torch.float64)
         env.sim.qpos[0, 6:10] = torch.stack([(0.5 * angle).cos(), 0 * angle, 0 * angle, (0.5 * angle).sin()])
         env.sim.qvel[:] = 0
@@ -141,8 +145,8 @@ def test_goals_are_quarter_turns(tmp_path, direction, way):
         goal = way * (len(reached) + 1) * math.pi / 2
         expected = [math.cos(goal), math.sin(goal), 0, -math.sin(goal), math.cos(goal), 0]
         assert made.obs["goal"][0, :6].tolist() == pytest.approx(expected, abs=1e-5)
-    assert reached == pytest.approx([k * math.pi / 2 - 0.1 for k in (1, 2, 3, 4)], abs=0.051)
-    assert made.info.score.item() == 4.0
+    assert reached == pytest.approx([k * math.pi / 2 - 0.1 for k in (1, 2)], abs=0.051)
+    assert made.info.score.item() == 2.0
 
 
 def test_a_tilted_object_reaches_no_goal(tmp_path):
@@ -158,17 +162,3 @@ def test_a_tilted_object_reaches_no_goal(tmp_path):
         made = env.step(torch.zeros(2, 2))
     assert made.info.score.tolist() == [1.0, 0.0]
     assert env.task.tilt.tolist() == pytest.approx([0.0, 0.5], abs=1e-6)
-
-
-@pytest.mark.parametrize("name", list(InPalmRotate.Rewards.model_fields))
-def test_a_weight_scales_its_term_alone(tmp_path, name):
-    one, two = (tmp_path / "one"), (tmp_path / "two")
-    one.mkdir(), two.mkdir()
-    more = MORE + "randomise: {push: {x: [-2 N, 2 N], interval: [0.1 s, 0.2 s]}}\n"
-    weight = lambda name: COSTS.get(f"rewards.{name}", getattr(InPalmRotate.Rewards(), name))  # noqa: E731
-    plain = tiny_env(one, 3, more=more, overrides=COSTS)
-    other = tiny_env(two, 3, more=more, overrides=COSTS | {f"rewards.{name}": 2 * weight(name)})
-    for action in random_actions(plain, 15):
-        a, b = plain.step(action).info.terms, other.step(action).info.terms
-        for term, value in a.items():
-            torch.testing.assert_close(b[term], value * (2 if term == name else 1))

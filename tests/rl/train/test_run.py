@@ -1,4 +1,4 @@
-"""Runs: what is written, going on after a kill at any instant, and what cannot be written."""
+"""Runs: their files, resuming after a kill, and files that cannot be written."""
 
 import csv
 import errno
@@ -77,8 +77,8 @@ def test_a_checkpoint_of_a_gpu_goes_on_on_a_cpu(tmp_path, monkeypatch):
     assert torch.equal(torch.get_rng_state(), state["processes"][0]["cpu"])
 
 
-def test_a_learner_is_told_how_much_of_its_run_is_over(tmp_path, monkeypatch):
-    """Of iterations, or of time, if of that more is over; what was learned before is included of both."""
+def test_a_learner_gets_the_share_of_its_run_that_is_over(tmp_path, monkeypatch):
+    """The larger share, of iterations or of time; both include the run before it was resumed."""
     run, learner = begun(tmp_path)
     shares, iterate = [], learner.iterate
     learner.iterate = lambda share: shares.append(share) or iterate(share)
@@ -175,8 +175,8 @@ def test_other_groups_networks_and_files_are_refused_by_name(tmp_path):
     assert int(more.env.steps.sum()) == 0
 
 
-def test_what_is_no_checkpoint_is_named(tmp_path):
-    """With what was found, and what would be right: nothing of torch's own advice, some of which is to run what is found."""
+def test_files_that_are_no_checkpoint_are_named(tmp_path):
+    """The message says what the file holds and what to do; it leaves out torch's advice to run the file's code."""
     file, other = tmp_path / "whole.pt", tmp_path / "other.pt"
     run, _ = begun(tmp_path)
     state = read_checkpoint(run._folder.checkpoint)
@@ -204,7 +204,7 @@ def test_what_is_no_checkpoint_is_named(tmp_path):
         read_checkpoint(tmp_path / "none.pt")
 
 
-def test_what_a_folder_says(tmp_path):
+def test_files_of_a_run(tmp_path):
     run, learner = begun(tmp_path)
     run.learn(3, float("inf"))
     folder = run._folder
@@ -229,7 +229,7 @@ def test_what_a_folder_says(tmp_path):
 @pytest.mark.parametrize(
     ("group", "value"), [("goal", torch.inf), ("priv_obj_props", torch.inf), ("priv_obj_props", torch.nan)]
 )
-def test_what_is_not_finite_is_in_no_checkpoint(tmp_path, group, value):
+def test_numbers_that_are_not_finite_end_a_run_before_its_checkpoint(tmp_path, group, value):
     """One number of one observation in the last iteration; its group is named."""
     run, learner = begun(tmp_path)
     run.learn(1, float("inf"))
@@ -306,53 +306,59 @@ from small_runs import small_learner
 from tgdsl.rl.train.folder import RunFolder, run_origin
 from tgdsl.rl.train.run import Run
 
-base, place = Path(sys.argv[2]), sys.argv[3]
-learner, loaded = small_learner(base)
-folder = RunFolder(base / "run")
-folder.begin(run_origin(loaded, learner.env, 0, {}, 1), loaded, learner.env)
-run = Run(learner, folder, 1e-9, "")
-run.learn(2, float("inf"))
-owner, name = {
-    "rollout": (learner.env, "step"),
-    "update": (learner.algorithm, "_take_step"),
-    "curve": (folder.__class__, "add_row"),
-    "writing": (os, "fsync"),
-    "replacing": (os, "replace"),
-}[place]
-before = getattr(owner, name)
+def train(base, place):
+    base.mkdir()
+    learner, loaded = small_learner(base)
+    folder = RunFolder(base / "run")
+    folder.begin(run_origin(loaded, learner.env, 0, {}, 1), loaded, learner.env)
+    run = Run(learner, folder, 1e-9, "")
+    run.learn(2, float("inf"))
+    owner, name = {
+        "update": (learner.algorithm, "_take_step"),
+        "curve": (folder.__class__, "add_row"),
+        "writing": (os, "fsync"),
+        "replacing": (os, "replace"),
+    }[place]
+    before = getattr(owner, name)
 
-def killed(*arguments, **named):
-    if place != "writing":
-        before(*arguments, **named)
-    os.kill(os.getpid(), signal.SIGKILL)
+    def killed(*arguments, **named):
+        if place != "writing":
+            before(*arguments, **named)
+        os.kill(os.getpid(), signal.SIGKILL)
 
-setattr(owner, name, killed)
-run.learn(100, float("inf"))
+    setattr(owner, name, killed)
+    run.learn(100, float("inf"))
+
+for place in sys.argv[3:]:
+    if not (child := os.fork()):
+        train(Path(sys.argv[2]) / place, place)
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL, place
 """
+KILLS = {"update": 2, "curve": 2, "writing": 2, "replacing": 3}
+"""Where a run is killed in its third iteration, and the iteration of its checkpoint then."""
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory):
+    """The folder of runs that one process has forked, each killed at another place."""
+    base = tmp_path_factory.mktemp("killed")
+    arguments = [sys.executable, "-c", KILLED, str(Path(__file__).parents[2] / "helpers"), str(base), *KILLS]
+    environ = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(arguments, capture_output=True, text=True, env=environ)
+    assert done.returncode == 0, done.stderr
+    return base
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("place", "iteration"),
-    [
-        pytest.param("rollout", 2, marks=pytest.mark.slow),
-        pytest.param("update", 2, marks=pytest.mark.slow),
-        pytest.param("curve", 2, marks=pytest.mark.slow),
-        ("writing", 2),
-        pytest.param("replacing", 3, marks=pytest.mark.slow),
-    ],
-)
-def test_a_run_that_is_killed_goes_on(tmp_path, place, iteration):
-    """SIGKILL in the third iteration: in its rollout, update, after its row was written, and around its checkpoint."""
-    learner, loaded = small_learner(tmp_path)
-    arguments = [sys.executable, "-c", KILLED, str(Path(__file__).parents[2] / "helpers"), str(tmp_path), place]
-    environ = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(arguments, capture_output=True, text=True, env=environ)
-    assert done.returncode == -signal.SIGKILL, done.stderr
-    folder = RunFolder(tmp_path / "run")
+@pytest.mark.parametrize("place", KILLS)
+def test_a_run_that_is_killed_goes_on(killed, place):
+    """SIGKILL in the third iteration: in its update, after its row was written, and around its checkpoint."""
+    learner, loaded = small_learner(killed / place)
+    folder = RunFolder(killed / place / "run")
     folder.check(is_resumed=True)
     state = read_checkpoint(folder.checkpoint)
-    assert state["iteration"] == iteration
+    assert state["iteration"] == KILLS[place]
     assert len([file for file in folder.path.iterdir() if file.name.startswith(".")]) == (place == "writing")
     restore(learner, state, folder.checkpoint)
     folder.begin(run_origin(loaded, learner.env, 0, {}, 1), loaded, learner.env)
