@@ -22,7 +22,7 @@ import tgdsl
 from tgdsl.commands.documents import Export, Verify
 from tgdsl.errors import ArtifactError, TgdslError
 from tgdsl.module.export.program import read_signature
-from tgdsl.module.export.verify import verify
+from tgdsl.module.export.verify import Verdict, verify
 
 ROOT = Path(__file__).parents[3]
 SENSORS = {
@@ -141,10 +141,17 @@ def test_files_of_others_and_of_other_taxels_are_refused(brief, tmp_path):
         verify(file, tgdsl.compile(document(tmp_path, {"a": {"links": "tip"}})))
 
 
-def test_the_commands_export_and_verify(brief, capsys):
-    _, file, printed = brief
+def test_the_commands_export_and_verify(brief, capsys, monkeypatch):
+    """The module that the command compares with the file is that of the document it was exported from."""
+    touch, file, printed = brief
     assert "in    0  body_pos                          float32  (env, 3, 3)" in printed
     assert "tgdsl verify hand.pt2" in printed
+
+    def verified(path, module, num_calls, progress):
+        assert (path, module.plan.origin, num_calls) == (file, touch.plan.origin, 2)
+        return Verdict({64: {"reading/a": 0.0}}, True)
+
+    monkeypatch.setattr("tgdsl.module.export.verify.verify", verified)
     Verify(file, calls=2).run()
     verdict = capsys.readouterr().out
     assert "64 environments, 2 calls" in verdict and "inputs of a wrong dtype are refused" in verdict
