@@ -1,9 +1,17 @@
 """Methods that are compiled from their second call on do what they do as they stand."""
 
+from functools import partial
+
 import pytest
 import torch
 
 from tgdsl.tensors.fused import FusedCall
+
+
+@pytest.fixture(autouse=True)
+def without_inductor(monkeypatch):
+    """Compile to graphs that are functional and run by torch: Inductor takes half a minute to begin."""
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="aot_eager"))
 
 
 class Counter:
