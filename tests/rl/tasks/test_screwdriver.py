@@ -266,21 +266,21 @@ def test_a_site_that_the_scene_lacks_is_named(tmp_path):
 @pytest.mark.slow
 def test_the_hand_holds_the_screwdriver_without_an_action():
     """With all that is random: for five seconds nine in ten stand, and nothing turns by itself."""
-    env = TouchEnv(DOCUMENT, 32, threads=1, overrides={"touch": "none"})
-    dropped = torch.zeros(32, dtype=torch.bool)
+    env = TouchEnv(DOCUMENT, 16, threads=1, overrides={"touch": "none"})
+    dropped = torch.zeros(16, dtype=torch.bool)
     for _ in range(200):
-        made = env.step(torch.zeros(32, 8))
+        made = env.step(torch.zeros(16, 8))
         dropped |= made.terminated
         assert not made.info.faults.any() and made.reward.isfinite().all()
-    assert dropped.sum() <= 3 and made.info.score[~dropped].abs().max() < 0.1
+    assert dropped.sum() <= 1 and made.info.score[~dropped].abs().max() < 0.1
     tip = env.now.watched.site_pos[:, 0] - env.task.upright_tip
     assert tip.norm(dim=1).max() < 2.5e-3
     env.close()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("touch", ["bool", "depth", "agg_force", "force_torque", "elastomer", "proximity", "force_taxel"])
-def test_every_kind_of_touch_begins_with_the_same_grasps(touch):
+@pytest.mark.parametrize("touch", ["force_torque", "elastomer", "proximity", "force_taxel"])
+def test_kinds_of_touch_of_every_quantity_begin_with_the_same_grasps(touch):
     env = TouchEnv(DOCUMENT, 4, threads=1, overrides={"touch": touch, "resolution": "low", "grasps.num": 16})
     obs = env.reset(0)
     assert obs["tactile_sensors"].abs().amax(dim=1).gt(0).all() and env.now.link_force.norm(dim=2).gt(0.1).sum(dim=1).min() >= 3
@@ -293,13 +293,13 @@ def test_every_kind_of_touch_begins_with_the_same_grasps(touch):
 def test_a_gait_spins_every_handle_the_right_way():
     """What the examples bring, with all that is random: more than 2 rad/s on average, and most hold for three seconds."""
     gait = runpy.run_path(str(DOCUMENT.with_name("screwdriver_gait.py")))["gait"]
-    env = TouchEnv(DOCUMENT, 32, threads=1, overrides={"touch": "none"})
-    obs, dropped, turned = env.reset(1), torch.zeros(32, dtype=torch.bool), torch.zeros(32)
+    env = TouchEnv(DOCUMENT, 16, threads=1, overrides={"touch": "none"})
+    obs, dropped, turned = env.reset(1), torch.zeros(16, dtype=torch.bool), torch.zeros(16)
     for _ in range(120):
         made = env.step(gait(env, obs))
         obs, dropped = made.obs, dropped | made.terminated
         turned += torch.where(dropped, 0.0, env.task.rate.float() * env.control_step)
-    assert dropped.sum() <= 16
+    assert dropped.sum() <= 8
     rate = (turned / 3.0).view(-1, 4)  # one column per handle
     assert rate.mean() > 2.0 and (rate.mean(dim=0) > 0.8).all()
     env.close()
