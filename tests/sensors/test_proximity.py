@@ -12,13 +12,17 @@ from oracles.setups.scenes import BOX, folder, module, state
 import tgdsl
 from tgdsl.errors import SpecError
 from tgdsl.module.state import SceneState
+from tgdsl.quantities import moment_fields
 from tgdsl.sensors.proximity import PROXIMITY
 from tgdsl.testing import KindConformance
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+def shared_cache(tmp_path_factory, monkeypatch):
+    """Fields whose errors are measured at few points, kept for all tests of this file."""
+    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path_factory.getbasetemp() / "coarse"))
+    monkeypatch.setattr(moment_fields, "CHOICE_POINTS", 200)
+    monkeypatch.setattr(moment_fields, "REPORT_POINTS", 200)
 
 
 class TestProximity(KindConformance):
