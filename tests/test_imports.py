@@ -49,6 +49,8 @@ def read_imports(text: str, file: Path) -> list[tuple[str, bool]]:
 
     def visit(node: ast.AST, is_inside: bool) -> None:
         for child in ast.iter_child_nodes(node):
+            if not isinstance(child, (ast.stmt, ast.excepthandler, ast.match_case)):
+                continue  # an expression imports nothing
             if isinstance(child, ast.Import):
                 found.extend((alias.name, is_inside) for alias in child.names)
             elif isinstance(child, ast.ImportFrom):

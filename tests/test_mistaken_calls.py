@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from benched_pads import bench_document
 from small_tasks import small_task
 
 import tgdsl
@@ -16,8 +17,8 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
 @pytest.fixture(scope="module")
-def touch():
-    return tgdsl.compile(EXAMPLES / "xhand1_palm.yaml")
+def touch(tmp_path_factory):
+    return tgdsl.compile(bench_document(tmp_path_factory.mktemp("pad")))
 
 
 @pytest.mark.parametrize(
@@ -52,7 +53,7 @@ def test_modules_readings_and_files(touch, tmp_path):
     with pytest.raises(ObservationError, match="found a SceneState, expected readings by name"):
         touch.observe(state)
     with pytest.raises(TgdslError, match="found a Tensor, expected readings by name"):
-        touch.images("touch", touch(state)["touch"])
+        touch.images("depth", touch(state)["depth"])
     with pytest.raises(TgdslError, match=r"x\.pt: an artefact is a safetensors file, expected a name such as x\.safetensors"):
         tgdsl.save(touch, tmp_path / "x.pt")
     assert not list(tmp_path.iterdir())
@@ -96,8 +97,8 @@ def test_steps_of_environments(tmp_path):
     torch.testing.assert_close(env.step(action).obs, again.step(torch.from_numpy(action)).obs)
 
 
-def test_a_device_that_is_not_there():
+def test_a_device_that_is_not_there(tmp_path):
     if torch.cuda.is_available():
         pytest.skip("there is a GPU")
     with pytest.raises(TgdslError, match=r'there is no device "cuda": .*; expected "cpu"'):
-        tgdsl.compile(EXAMPLES / "xhand1_palm.yaml", device="cuda")
+        tgdsl.compile(bench_document(tmp_path), device="cuda")

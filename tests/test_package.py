@@ -1,6 +1,7 @@
 """What `import tgdsl` offers, and how it looks in a console: the same tuples, dictionaries and arrays to code."""
 
 import dataclasses
+import json
 import os
 import pickle
 import re
@@ -47,11 +48,27 @@ def touch(tmp_path_factory):
     )
 
 
-def in_python(code):
+IMPORTS = """
+import json, sys
+import tgdsl
+loaded = {}
+import tgdsl.commands.cli
+loaded["cli"] = [*sys.modules]
+tgdsl.load
+loaded["load"] = [*sys.modules]
+import tgdsl.rl.env, tgdsl.rl.playing.rollout, tgdsl.module.explain
+loaded["env"] = [*sys.modules]
+print(json.dumps([loaded, tgdsl.testing.KindConformance.__name__, tgdsl.__version__]))
+"""
+
+
+@pytest.fixture(scope="module")
+def imported():
+    """What a new process has imported, stage by stage, and names that `import tgdsl` hands out."""
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "PYTHONWARNINGS": "error"}
-    ran = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    ran = subprocess.run([sys.executable, "-c", IMPORTS], env=environment, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
-    return ran.stdout.split()
+    return json.loads(ran.stdout)
 
 
 def test_dir_has_the_public_names_and_no_others():
@@ -63,35 +80,28 @@ def test_dir_has_the_public_names_and_no_others():
     assert errors - inside <= set(dir(tgdsl))
 
 
-@pytest.mark.slow
-def test_testing_and_version_are_reached_by_importing_tgdsl_alone():
-    said = in_python(
-        "import sys, tgdsl; print('torch' in sys.modules, tgdsl.testing.KindConformance.__name__, tgdsl.__version__)"
-    )
-    assert said == ["False", "KindConformance", version("tgdsl")]
+def test_testing_and_version_are_reached_by_importing_tgdsl_alone(imported):
+    assert imported[1:] == ["KindConformance", version("tgdsl")]
 
 
-def test_help_waits_for_nothing_heavy():
+def test_help_waits_for_nothing_heavy(imported):
     """All commands are known without what any of them needs to run; no robot, document or module is looked at."""
     heavy = {"torch", "mujoco", "numpy", "scipy", "pydantic", "ruamel", "matplotlib", "trimesh", "tgdsl.compiler"}
-    said = in_python("import sys, tgdsl.commands.cli; print(*sys.modules)")
-    assert "tgdsl.commands.cli" in said
-    assert not heavy & set(said)
+    assert "tgdsl.commands.cli" in imported[0]["cli"]
+    assert not heavy & set(imported[0]["cli"])
 
 
-def test_loading_waits_for_what_only_compiling_needs():
+def test_loading_waits_for_what_only_compiling_needs(imported):
     """SciPy takes 0.3 s; what bakes tables, analyses modes or reads robots is imported where it is used."""
     heavy = {"scipy", "skfem", "trimesh", "mujoco", "ruamel", "matplotlib", "pymeshlab", "sympy", "torch._dynamo"}
-    said = in_python("import sys, tgdsl; tgdsl.load; print(*sys.modules)")
-    assert "torch" in said
-    assert not heavy & set(said)
+    assert "torch" in imported[0]["load"]
+    assert not heavy & set(imported[0]["load"])
 
 
-def test_environments_leave_triton_alone():
+def test_environments_leave_triton_alone(imported):
     """Its LLVM and that of MuJoCo's software renderer, which `MUJOCO_GL=osmesa` loads, do not go into one process."""
-    assert in_python(
-        "import sys, tgdsl.rl.env, tgdsl.rl.playing.rollout, tgdsl.module.explain; print('triton' in sys.modules)"
-    ) == ["False"]
+    assert "tgdsl.rl.env" in imported[0]["env"]
+    assert "triton" not in imported[0]["env"]
 
 
 def test_changelog_citation_and_package_name_one_version():

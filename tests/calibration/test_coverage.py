@@ -40,7 +40,7 @@ class Case(NamedTuple):
     true: dict[str, float]
     lower: float = 0.0
     untold: tuple[str, ...] = ()
-    num_tested: int = 6
+    num_tested: int = 3
 
 
 def on_pad(kind: str, **keys: Any) -> dict[str, dict[str, Any]]:
@@ -93,6 +93,8 @@ CASES = {
     ),
     "actuation_audio": Case({"touch": WHINE}, {"touch.load": 2e-3, "touch.pitch": 0.5}, num_tested=1),
 }
+QUICK = "elastomer, gaussian"
+"""The case whose test is not slow."""
 
 
 def document(folder: Path, case: Case) -> Path:
@@ -173,13 +175,13 @@ def assert_covered(held: list[bool]) -> None:
 
 
 def test_intervals_cover_the_truth(tmp_path):
-    assert_covered(hits(tmp_path, CASES["elastomer, gaussian"], 4))
+    assert_covered(hits(tmp_path, CASES[QUICK], 4))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_intervals_of_each_kind_cover_the_truth(tmp_path, case):
-    assert_covered(hits(tmp_path, case, case.num_tested))
+@pytest.mark.parametrize("name", [name for name in CASES if name != QUICK])
+def test_intervals_of_each_kind_cover_the_truth(tmp_path, name):
+    assert_covered(hits(tmp_path, CASES[name], CASES[name].num_tested))
 
 
 @pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.untold])
@@ -187,9 +189,8 @@ def test_what_no_reading_tells_apart_is_named(tmp_path, name):
     """Displacement depends on the ratio of the two moduli alone."""
     case = CASES[name]
     path = document(tmp_path, case)
-    for seed in range(3):
-        fit = tgdsl.calibrate(path, recording(path, case, seed), list(case.untold), starts=1, intervals="none")
-        assert any(all(name in text for name in case.untold) for text in fit.warnings), fit.warnings
+    fit = tgdsl.calibrate(path, recording(path, case, 0), list(case.untold), starts=1, intervals="none")
+    assert any(all(name in text for name in case.untold) for text in fit.warnings), fit.warnings
 
 
 def cooling(path: Path) -> Path:

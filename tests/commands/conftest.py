@@ -50,3 +50,10 @@ def plugged(monkeypatch):
 def checked_often(monkeypatch):
     """Look after each episode's length whether all have ended: those of the small task last 8 control steps."""
     monkeypatch.setattr("tgdsl.rl.playing.evaluation.CHECK_INTERVAL", 8)
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Draw nothing: a picture takes a second."""
+    for name in ("picture", "overview"):
+        monkeypatch.setattr(f"tgdsl.view.{name}.{name}", lambda touch, sim, readings, file, **_: file)

@@ -64,13 +64,6 @@ main()
 
 
 @pytest.fixture
-def no_pictures(monkeypatch):
-    """Draw nothing: a picture takes a second."""
-    for name in ("picture", "overview"):
-        monkeypatch.setattr(f"tgdsl.view.{name}.{name}", lambda touch, sim, readings, file, **_: file)
-
-
-@pytest.fixture
 def fails(here):
     """Run a command that a user got wrong; return what it says."""
 

@@ -29,6 +29,7 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path, here):
 
 
 @pytest.mark.filterwarnings("ignore:.*no hinge turns by more than")
+@pytest.mark.usefixtures("no_pictures")
 def test_a_recording_must_have_steps_and_fit_its_document(tmp_path, here):
     small_task(tmp_path)
     sensors = tmp_path / "sensors.yaml"

@@ -14,8 +14,8 @@ from tgdsl.placement.freeze import frozen_files
 from tgdsl.schema.load import load_layout
 
 REPOSITORY = Path(__file__).parents[2]
-WITHOUT_TAXELS = ("xhand1_calibration", "materials_audio")
-EXAMPLES = [path for path in sorted((REPOSITORY / "examples").glob("*.yaml")) if path.stem not in WITHOUT_TAXELS]
+EXAMPLES = [REPOSITORY / "examples" / f"{name}.yaml" for name in ("pyramid", "xhand1_palm")]
+"""Examples of the two layouts."""
 ARRAYS = ("link_id", "pos", "normal", "tangent", "radius", "area", "cell")
 HAND = """
 <mujoco>
@@ -49,7 +49,7 @@ def assert_same_bits(one: Layout, other: Layout) -> None:
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
-def test_taxels_of_each_example_keep_their_bits(example, tmp_path):
+def test_taxels_of_examples_keep_their_bits(example, tmp_path):
     spec, sampled = all_layouts(example, {})
     atomic_write_all(frozen_files(spec, sampled, tmp_path / "frozen.yaml", example.name))
     assert set(sampled) == set(spec.resolutions)

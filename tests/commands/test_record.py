@@ -2,10 +2,8 @@
 
 import os
 import signal
-import subprocess
-import sys
+import threading
 import time
-from pathlib import Path
 
 import pytest
 from faulty_lines import Faults
@@ -15,8 +13,6 @@ from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.log import log as log_file
 from tgdsl.runtime.xhand1.log.log import open_log
 from tgdsl.runtime.xhand1.wire.protocol import Command
-
-REPOSITORY = Path(__file__).parents[2]
 
 
 def test_record_and_replay(emulator, plugged, here, tmp_path):
@@ -74,28 +70,30 @@ def test_a_recording_through_failures_shows_and_keeps_them(emulator, here, tmp_p
     assert f"NO NEW READING: {log.faults[-1].kind}: {log.faults[-1].message}" in said
 
 
-@pytest.mark.parametrize("action", ["monitor", "record"])
-def test_ctrl_c_closes_the_port_and_keeps_the_log(emulator, tmp_path, action):
-    environment = {**os.environ, "PYTHONWARNINGS": "error", "PYTHONPATH": str(REPOSITORY), "NO_COLOR": "1"}
-    arguments = ["monitor"] if action == "monitor" else ["record", "a.npz"]
-    # What a shell starts in the background ignores SIGINT, and so do its children, tests among them.
-    heeding = "import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler); runpy.run_module('tgdsl', run_name='__main__')"
-    command = [sys.executable, "-c", heeding, "hand", *arguments, "--port", emulator.device, "--hand-id", "0"]
-    with subprocess.Popen(
-        command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        try:
-            while sum(frame.command == Command.EXCHANGE for _, frame in list(emulator.requests)) < 100:
-                assert process.poll() is None, process.communicate()
-                time.sleep(0.01)
-            process.send_signal(signal.SIGINT)
-            said, error = process.communicate(timeout=60)
-        finally:
-            process.kill()
-    assert (process.returncode, error) == (0, "")
+@pytest.fixture
+def interrupt():
+    """Return a function that presses Ctrl-C once a condition holds; the process may have been started to ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def press(is_time):
+        while not is_time():
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    yield lambda is_time: threading.Thread(target=press, args=(is_time,), daemon=True).start()
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("words", [("monitor",), ("record", "a.npz")])
+def test_ctrl_c_closes_the_port_and_keeps_the_log(emulator, here, interrupt, tmp_path, words):
+    arguments = ("--seconds", "60", "--port", emulator.device, "--hand-id", "0")
+    interrupt(lambda: sum(frame.command == Command.EXCHANGE for _, frame in list(emulator.requests)) >= 100)
+    code, said, error = here(tmp_path, "hand", *words, *arguments)
+    assert (code, error) == (0, "")
     assert said.splitlines()[0].startswith(f"{emulator.device}: hand 0")
-    if action == "record":
-        assert open_log(tmp_path / "a.npz").num_readings >= 1
+    if words[0] == "record":
+        log = open_log(tmp_path / "a.npz")
+        assert log.num_readings >= 1 and log.seconds < 50
         assert [file.name for file in tmp_path.iterdir()] == ["a.npz"]
     with XHand1.open(emulator.device) as hand:  # the port is free again
         hand.read(20.0)

@@ -6,6 +6,7 @@ import shlex
 import signal
 import sys
 import time
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -362,11 +363,12 @@ def test_the_stage_of_a_learner_has_each_control_step_and_changes_nothing(tmp_pa
 
 
 @pytest.mark.slow
-def test_a_viewed_learner_goes_on_when_the_page_is_opened_closed_and_lost(tmp_path):
+def test_a_viewed_learner_goes_on_when_the_page_is_opened_closed_and_lost(tmp_path, capsys):
     bare, _ = small_learner(tmp_path)
     viewed, _ = small_learner(tmp_path)
     torch.manual_seed(0)
     with learner_page(viewed) as page:
+        assert capsys.readouterr().out == f"view: {page.url}\n" and page.url.startswith("http://localhost:")
         viewed.iterate()
         for _ in range(2):
             with silent_browser(page.url):
@@ -384,8 +386,9 @@ def test_a_viewed_learner_goes_on_when_the_page_is_opened_closed_and_lost(tmp_pa
         assert torch.equal(value, viewed.algorithm.actor.state_dict()[name])
 
 
-@pytest.mark.slow
-def test_view_names_the_page(base, here):
-    code, out, error = here(base, "train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS, "--view")
+def test_view_opens_the_page_of_the_learner(base, here, monkeypatch):
+    viewed = []
+    monkeypatch.setattr("tgdsl.commands.train.learner_page", lambda learner: viewed.append(learner) or nullcontext())
+    code, _, error = here(base, "train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS, "--view")
     assert code == 0, error
-    assert out.startswith("view: http://localhost:")
+    assert [learner.iteration for learner in viewed] == [1]

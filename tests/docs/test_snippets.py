@@ -6,7 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import tyro
 from snippets import REPOSITORY, Snippet, check_text, check_yaml, command_lines, pages, parse, snippets, tgdsl_arguments
+
+from tgdsl.commands.cli import Command
 
 PAGES = {str(page.relative_to(REPOSITORY)): page for page in pages()}
 INLINE = re.compile(r"(?<!`)`tgdsl ([^`]+)`(?!`)")
@@ -105,15 +108,16 @@ def test_commands_in_the_text_exist_with_their_options(name, capsys):
             assert re.search(rf"{option}\b", said), f"{name}: `tgdsl {found}`: {option} is no option"
 
 
+HELP: dict[tuple[str, ...], str] = {}
+
+
 def help_of(command, capsys):
-    import tyro
-
-    from tgdsl.commands.cli import Command
-
-    with pytest.raises(SystemExit) as ended:
-        tyro.cli(Command, prog="tgdsl", args=[*command, "--help"])  # type: ignore[arg-type]
-    assert ended.value.code == 0, command
-    return capsys.readouterr().out
+    if (key := tuple(command)) not in HELP:
+        with pytest.raises(SystemExit) as ended:
+            tyro.cli(Command, prog="tgdsl", args=[*command, "--help"])  # type: ignore[arg-type]
+        assert ended.value.code == 0, command
+        HELP[key] = capsys.readouterr().out
+    return HELP[key]
 
 
 def test_a_wrong_line_is_found():

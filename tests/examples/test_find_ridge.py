@@ -228,13 +228,6 @@ def test_a_minute_of_learning_with_touch_is_far_above_chance(tmp_path):
     assert result.success > 0.6 > 5.0 * result.chance
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings(TORCHSCRIPT)
-def test_without_touch_nothing_but_chance_is_learned(tmp_path):
-    result = run("blind", 50, tmp_path)
-    assert result.interval[0] < 1.5 * result.chance
-
-
 def test_a_hand_is_told_what_the_scene_tells(make):
     """The command follows from targets, actions and time alone."""
     env, generator = make(2), torch.Generator().manual_seed(0)

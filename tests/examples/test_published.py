@@ -22,13 +22,14 @@ def test_each_document_is_tried():
 @pytest.mark.parametrize("name", FEW)
 def test_a_teacher_and_its_students_learn_a_few_iterations(name, tmp_path):
     document, out = FOLDER / f"{name}.yaml", tmp_path / "teacher"
-    Train(document, device="cpu", envs=4, iterations=2, episodes=0, out=out, set=FEW[name]).run()
+    few = (*FEW[name], "train.steps=4", "distill.steps=4")
+    Train(document, device="cpu", envs=2, iterations=1, episodes=0, out=out, set=few).run()
     card = json.loads((out / "policy.json").read_text())
     goal = {"in_palm_rotate": 1, "in_hand_repose": 13}
     assert card["groups"].get("goal") == goal.get(name) and card["groups"]["priv_touch"] == 15
     students = tmp_path / "students"
-    options = {"device": "cpu", "types": "none,agg_bool,force", "seeds": 1, "envs": 48, "iterations": 2, "episodes": 0}
-    Distill(document, teacher=out / "policy.pt", out=students, set=FEW[name], **options).run()
+    options = {"device": "cpu", "types": "none,agg_bool,force", "seeds": 1, "envs": 6, "iterations": 2, "episodes": 0}
+    Distill(document, teacher=out / "policy.pt", out=students, set=few, **options).run()
     with (students / "med" / "curve.csv").open(newline="") as opened:
         rows = list(csv.DictReader(opened))
     losses = [float(value) for name, value in rows[-1].items() if name.startswith("Loss/") and name.endswith("s0")]
