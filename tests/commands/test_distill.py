@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import sys
 
 import pytest
@@ -35,15 +36,22 @@ def rows_of(file):
         return list(csv.DictReader(opened))
 
 
-@pytest.fixture
-def base(tmp_path):
-    task = felt_task(tmp_path)
-    sensors = (tmp_path / "sensors.yaml").read_text()
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A folder with a task of two resolutions and a teacher."""
+    folder = tmp_path_factory.mktemp("task")
+    task = felt_task(folder)
+    sensors = (folder / "sensors.yaml").read_text()
     dense = "      high:\n        tip: {method: grid, rows: 3, columns: 3, direction: [0, 0, 1], radius: 8 mm}\n"
     dense += "        finger: {method: grid, rows: 3, columns: 2, direction: [0, -1, 0], radius: 8 mm}\nobjects:"
-    (tmp_path / "sensors.yaml").write_text(sensors.replace("objects:", dense, 1))
-    teacher(tmp_path / "teacher.pt", load_task(task), ["priv_proprio", "priv_obj_state"])
-    return tmp_path
+    (folder / "sensors.yaml").write_text(sensors.replace("objects:", dense, 1))
+    teacher(folder / "teacher.pt", load_task(task), ["priv_proprio", "priv_obj_state"])
+    return folder
+
+
+@pytest.fixture
+def base(written, tmp_path):
+    return shutil.copytree(written, tmp_path, dirs_exist_ok=True)
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
 """Heat: conduction within a link, and between what touches, against Carslaw and Jaeger, *Conduction of Heat in Solids*."""
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -101,17 +102,23 @@ def order_in_space(numbers: Any = (1, 2, 1)):
     return 2.0, np.log2(np.divide(errors[:-1], errors[1:]))
 
 
+@cache
+def risen(seconds: float, flux: float, depth: float, n: int, dt: float = 0.05) -> np.ndarray:
+    """Return how much the cells of a thick solid warm, from its heated surface on [K]."""
+    sensor = {"cells": [1, 1, n], "material": "steel", "source": {"flux": f"{flux} W/m2", "face": "+z"}}
+    *_, last = heated({"block": [0.01, 0.02, depth]}, sensor, dt, round(seconds / dt))
+    return last["heat"][0, :, 0].numpy()[::-1] - 22.0
+
+
 @oracle(
     "A thick solid under a constant flux, after {seconds:g} s", "ΔT = 2q/k (√(αt/π) e^(−x²/4αt) − x/2 erfc(x/√4αt))",
     "Carslaw and Jaeger 2.9", "rise of temperature [K]", "depth [m]", each=[10.0], also=[1.0],
 )  # fmt: skip
 def thick_solid(seconds: float, flux: float = 5000.0, depth: float = 0.2, n: int = 200, dt: float = 0.05):
-    sensor = {"cells": [1, 1, n], "material": "steel", "source": {"flux": f"{flux} W/m2", "face": "+z"}}
-    *_, last = heated({"block": [0.01, 0.02, depth]}, sensor, dt, round(seconds / dt))
     x, diffusion = (np.arange(n) + 0.5) * depth / n, 4 * ALPHA * round(seconds / dt) * dt
     root, scale = np.sqrt(diffusion / 4 / np.pi), 2 * flux / STEEL.conductivity
     exact = scale * (root * np.exp(-(x**2) / diffusion) - 0.5 * x * erfc(x / np.sqrt(diffusion)))
-    return Values(exact, last["heat"][0, :, 0].numpy()[::-1] - 22.0, at=x, atol=0.01 * scale * root)
+    return Values(exact, risen(seconds, flux, depth, n, dt), at=x, atol=0.01 * scale * root)
 
 
 @oracle(
@@ -119,7 +126,7 @@ def thick_solid(seconds: float, flux: float = 5000.0, depth: float = 0.2, n: int
     "rise of temperature [K]", at=["surface"], rtol=0.01, each=[10.0], also=[1.0],
 )  # fmt: skip
 def thick_solids_surface(seconds: float, flux: float = 5000.0, depth: float = 0.2, n: int = 200):
-    ours = thick_solid(seconds, flux, depth, n).ours[0] + flux * 0.5 * depth / n / STEEL.conductivity
+    ours = risen(seconds, flux, depth, n)[0] + flux * 0.5 * depth / n / STEEL.conductivity
     return 2 * flux / STEEL.conductivity * np.sqrt(ALPHA * seconds / np.pi), ours
 
 
