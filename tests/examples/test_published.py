@@ -28,7 +28,7 @@ def test_a_teacher_and_its_students_learn_a_few_iterations(name, tmp_path):
     goal = {"in_palm_rotate": 1, "in_hand_repose": 13}
     assert card["groups"].get("goal") == goal.get(name) and card["groups"]["priv_touch"] == 15
     students = tmp_path / "students"
-    options = {"device": "cpu", "types": "none,agg_bool,force", "seeds": 1, "envs": 6, "iterations": 2, "episodes": 0}
+    options = {"device": "cpu", "types": "none,agg_bool,force", "seeds": 1, "envs": 48, "iterations": 2, "episodes": 0}
     Distill(document, teacher=out / "policy.pt", out=students, set=few, **options).run()
     with (students / "med" / "curve.csv").open(newline="") as opened:
         rows = list(csv.DictReader(opened))
