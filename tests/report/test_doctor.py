@@ -1,4 +1,4 @@
-"""What is said of an installation, by versions written by hand."""
+"""Findings about an installation, from made-up versions."""
 
 import importlib.metadata
 import json
@@ -31,81 +31,93 @@ REQUIREMENTS = [
 COMPILERS = {CPP: "/usr/bin/g++"}
 
 
-def known(monkeypatch, **versions):
-    """The packages of REQUIREMENTS, in versions that fit or in others; None: not installed."""
-    there = FITTING | {name.replace("_", "-"): version for name, version in versions.items()}
+def installed_packages(monkeypatch, **versions):
+    """Return the packages of REQUIREMENTS in fitting versions or in these; None: not installed."""
+    installed = FITTING | {name.replace("_", "-"): version for name, version in versions.items()}
 
     def version(name):
-        if there.get(name) is None:
+        if installed.get(name) is None:
             raise importlib.metadata.PackageNotFoundError(name)
-        return there[name]
+        return installed[name]
 
     monkeypatch.setattr(importlib.metadata, "version", version)
     return packages(REQUIREMENTS)
 
 
-def told(found, gpu=False):
-    places = {"cpu": "", **({"cuda:0": ""} if gpu else {})}
-    return {(each.level, each.what) for each in findings(found, COMPILERS, places, {}) if each.what != "torch sees no GPU"}
+def levels_and_texts(installed, gpu=False):
+    devices = {"cpu": "", **({"cuda:0": ""} if gpu else {})}
+    return {
+        (finding.level, finding.what)
+        for finding in findings(installed, COMPILERS, devices, {})
+        if finding.what != "torch sees no GPU"
+    }
 
 
-def test_packages_are_those_of_this_platform_and_not_of_tgdsls_own_development(monkeypatch):
-    assert known(monkeypatch) == (
+def test_packages_of_other_platforms_and_of_development_are_left_out(monkeypatch):
+    assert installed_packages(monkeypatch) == (
         Package("mujoco", "3.17.0", "!=4.0.0,<5,>=3.17.0", ""),
         Package("numpy", "2.4.6", ">=2.0", ""),
         Package("torch", "2.10.0", ">=2.10", ""),
         Package("mujoco-warp", "3.17.2", "<3.18,>=3.17.0", "gpu"),
     )
-    assert told(known(monkeypatch)) == set()
+    assert levels_and_texts(installed_packages(monkeypatch)) == set()
 
 
-def test_a_version_that_is_not_wanted_is_a_fault(monkeypatch):
-    found = known(monkeypatch, numpy="1.26.4")
-    assert told(found) == {("fault", "numpy is 1.26.4, expected >=2.0")}
-    assert told(known(monkeypatch, torch=None)) == {("fault", "torch is not installed, and tgdsl cannot do without it")}
+def test_an_unsupported_version_is_a_fault(monkeypatch):
+    installed = installed_packages(monkeypatch, numpy="1.26.4")
+    assert levels_and_texts(installed) == {("fault", "numpy is 1.26.4, expected >=2.0")}
+    assert levels_and_texts(installed_packages(monkeypatch, torch=None)) == {
+        ("fault", "torch is not installed, and tgdsl cannot do without it")
+    }
 
 
 @pytest.mark.parametrize("version", ["4.0.0", "4.0.0.0"])
 def test_mujoco_with_the_fault_in_its_solver_is_named(monkeypatch, version):
-    assert ("fault", "MuJoCo 4.0.0 has a fault in its solver where Jacobians are sparse") in told(
-        known(monkeypatch, mujoco=version, mujoco_warp=None)
+    assert ("fault", "MuJoCo 4.0.0 has a fault in its solver where Jacobians are sparse") in levels_and_texts(
+        installed_packages(monkeypatch, mujoco=version, mujoco_warp=None)
     )
 
 
-def test_a_simulator_beside_another_versions_models_is_a_fault(monkeypatch):
-    assert told(known(monkeypatch, mujoco="3.18.1")) == {("fault", "MuJoCo 3.18.1 with MuJoCo Warp 3.17.2")}
+def test_versions_of_mujoco_and_mujoco_warp_must_match(monkeypatch):
+    assert levels_and_texts(installed_packages(monkeypatch, mujoco="3.18.1")) == {
+        ("fault", "MuJoCo 3.18.1 with MuJoCo Warp 3.17.2")
+    }
 
 
-def test_what_is_missing_says_what_cannot_be_done(monkeypatch):
-    (finding,) = (f for f in findings(known(monkeypatch, mujoco_warp=None), COMPILERS, {"cpu": "", "cuda:0": ""}, {}))
+def test_a_missing_package_names_its_extra(monkeypatch):
+    (finding,) = (
+        f for f in findings(installed_packages(monkeypatch, mujoco_warp=None), COMPILERS, {"cpu": "", "cuda:0": ""}, {})
+    )
     assert (finding.level, finding.what) == ("missing", "mujoco-warp is not installed")
     assert 'pip install "tgdsl[gpu]"' in finding.then
 
 
-def test_triton_is_missed_where_there_is_a_gpu(monkeypatch):
+def test_missing_triton_is_reported_with_a_gpu_only(monkeypatch):
     without = (Package("triton", None, ">=3.6", "dev"),)
-    assert told(without) == set()
-    assert told(without, gpu=True) == {("slower", "triton is not installed")}
+    assert levels_and_texts(without) == set()
+    assert levels_and_texts(without, gpu=True) == {("slower", "triton is not installed")}
 
 
-def test_faults_are_told_first(monkeypatch):
-    found = findings(known(monkeypatch, numpy="1.0", mujoco_warp=None, torch="2.13.0"), {CPP: None}, {"cpu": ""}, {})
-    assert [finding.level for finding in found] == ["fault", "slower", "missing", "note", "note"]
+def test_faults_come_first(monkeypatch):
+    sorted_findings = findings(
+        installed_packages(monkeypatch, numpy="1.0", mujoco_warp=None, torch="2.13.0"), {CPP: None}, {"cpu": ""}, {}
+    )
+    assert [finding.level for finding in sorted_findings] == ["fault", "slower", "missing", "note", "note"]
 
 
-def test_every_optional_package_of_ours_is_explained():
-    """What the extras for users bring; those for development bring what only tests need."""
-    own = {
+def test_every_optional_package_is_explained():
+    """Extras for users only: those for development serve the tests."""
+    optional = {
         requirement.name.lower()
         for requirement in map(Requirement, importlib.metadata.requires("tgdsl") or ())
         if requirement.marker is not None and not any(f'"{extra}"' in str(requirement.marker) for extra in DEVELOPMENT)
     }
-    assert own
-    assert own <= WITHOUT.keys()
+    assert optional
+    assert optional <= WITHOUT.keys()
 
 
 def test_this_installation(monkeypatch, tmp_path):
-    """Caches are as large as their files; torch's and MuJoCo's versions are their own."""
+    """Caches are as large as their files; versions are those that torch and MuJoCo report."""
     import mujoco
 
     monkeypatch.setenv("TGDSL_CACHE", str(tmp_path / "own"))
@@ -116,18 +128,18 @@ def test_this_installation(monkeypatch, tmp_path):
     (tmp_path / "inductor" / "ab").mkdir(parents=True)
     (tmp_path / "inductor" / "ab" / "kernel.so").write_bytes(b"123")
     (tmp_path / "inductor" / "link.so").symlink_to("ab/kernel.so")
-    found = examine()
-    versions = {package.name: package.installed for package in found.packages}
+    installation = examine()
+    versions = {package.name: package.installed for package in installation.packages}
     assert (versions["torch"], versions["mujoco"]) == (torch.__version__, mujoco.__version__)
-    assert found.caches == {str(tmp_path / "own"): 5, str(tmp_path / "inductor"): 3, str(tmp_path / "warp"): None}
+    assert installation.caches == {str(tmp_path / "own"): 5, str(tmp_path / "inductor"): 3, str(tmp_path / "warp"): None}
     assert folder_size(tmp_path) == 8
-    assert found.devices["cpu"] == f"{torch.get_num_threads()} threads"
-    assert len(found.devices) == 1 + torch.cuda.device_count()
-    assert not found.opengl["glfw"] or "DISPLAY" in os.environ or sys.platform != "linux"
+    assert installation.devices["cpu"] == f"{torch.get_num_threads()} threads"
+    assert len(installation.devices) == 1 + torch.cuda.device_count()
+    assert not installation.opengl["glfw"] or "DISPLAY" in os.environ or sys.platform != "linux"
 
 
 def test_the_command(monkeypatch, capsys):
-    """A table, or JSON; exit code 1 at a fault alone."""
+    """A table or JSON; only faults exit with code 1."""
     sound = examine()
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr(doctor, "examine", lambda: sound)
@@ -143,14 +155,14 @@ def test_the_command(monkeypatch, capsys):
         located_warnings(sound),
     )
     monkeypatch.setattr(doctor, "examine", lambda: broken)
-    with pytest.raises(SystemExit) as stopped:
+    with pytest.raises(SystemExit) as error:
         Doctor().run()
-    assert stopped.value.code == 1
-    printed = capsys.readouterr().out
-    assert "numpy    1.0        >=2.0" in printed and "/nowhere  none yet" in printed
-    assert 'fault: numpy is 1.0, expected >=2.0: pip install "numpy>=2.0"\n' in printed
-    assert "egl        draws" in printed
-    assert "missing: no OpenGL by MUJOCO_GL=glfw: `tgdsl play --video` is refused: set MUJOCO_GL=egl\n" in printed
+    assert error.value.code == 1
+    output = capsys.readouterr().out
+    assert "numpy    1.0        >=2.0" in output and "/nowhere  none yet" in output
+    assert 'fault: numpy is 1.0, expected >=2.0: pip install "numpy>=2.0"\n' in output
+    assert "egl        draws" in output
+    assert "missing: no OpenGL by MUJOCO_GL=glfw: `tgdsl play --video` is refused: set MUJOCO_GL=egl\n" in output
 
 
 def located_warnings(sound):

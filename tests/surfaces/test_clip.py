@@ -1,4 +1,4 @@
-"""A surface clipped to a region: area, place and orientation of what is left."""
+"""Surfaces clipped to a region: area, position and orientation of the rest."""
 
 import numpy as np
 import pytest
@@ -18,11 +18,11 @@ def bounds(low, high):
 
 
 def test_a_rectangle_is_cut_out_of_a_face():
-    left = clip(surface_of(box((0.04, 0.03, 0.02))), READ([UP, bounds([-0.01, -0.005, 0], [0.015, 1, 1])]))
-    np.testing.assert_allclose(left.face_areas.sum(), 0.025 * 0.02, rtol=1e-9)
-    np.testing.assert_allclose(left.face_normals, np.broadcast_to([0, 0, 1.0], (len(left.faces), 3)), atol=1e-12)
+    clipped = clip(surface_of(box((0.04, 0.03, 0.02))), READ([UP, bounds([-0.01, -0.005, 0], [0.015, 1, 1])]))
+    np.testing.assert_allclose(clipped.face_areas.sum(), 0.025 * 0.02, rtol=1e-9)
+    np.testing.assert_allclose(clipped.face_normals, np.broadcast_to([0, 0, 1.0], (len(clipped.faces), 3)), atol=1e-12)
     np.testing.assert_allclose(
-        [left.vertices.min(axis=0), left.vertices.max(axis=0)], [[-0.01, -0.005, 0.01], [0.015, 0.015, 0.01]]
+        [clipped.vertices.min(axis=0), clipped.vertices.max(axis=0)], [[-0.01, -0.005, 0.01], [0.015, 0.015, 0.01]]
     )
 
 
@@ -37,8 +37,8 @@ def test_halves_add_up_whatever_the_triangles():
 
 
 def test_geoms_keep_their_names():
-    left = clip(surface_of(ball(0.01), ball(0.01, (0.03, 0, 0))), READ({"geoms": "g1"}))
-    assert {left.geoms[i][0] for i in left.face_geom} == {"g1"}
+    clipped = clip(surface_of(ball(0.01), ball(0.01, (0.03, 0, 0))), READ({"geoms": "g1"}))
+    assert {clipped.geoms[i][0] for i in clipped.face_geom} == {"g1"}
 
 
 @pytest.mark.parametrize(
@@ -49,6 +49,6 @@ def test_geoms_keep_their_names():
         ({"geoms": "g2"}, 'no geom or mesh of this link matches "g2"'),
     ],
 )
-def test_what_cannot_be_cut(region, message):
+def test_regions_that_cannot_be_cut_are_refused(region, message):
     with pytest.raises(SampleError, match=message):
         clip(surface_of(box((0.04, 0.03, 0.02))), READ(region))

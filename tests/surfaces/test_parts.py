@@ -1,4 +1,4 @@
-"""Parts that touch along edges alone: each remains whole and closed, whichever face the file has first."""
+"""Parts that touch only along edges: each stays whole and closed, whichever face comes first in the file."""
 
 import numpy as np
 import pytest
@@ -14,25 +14,25 @@ PLACES = [(x, y, z) for x in range(3) for y in range(3) for z in range(3)]
 
 @pytest.mark.parametrize("first", [0, 1, 5, 77, 100])
 @pytest.mark.parametrize("odd", [0, 1])
-def test_cubes_of_a_checkerboard(first, odd):
-    """Thirteen or fourteen cubes of 1 m³ that share edges in fours and no faces, wound around their centres and no gap's."""
+def test_checkerboard_cubes_stay_whole(first, odd):
+    """13 or 14 cubes of 1 m³ share edges but no faces; the surface winds around their centres, not around gaps."""
     is_cube = [sum(place) % 2 == odd for place in PLACES]
     mesh = trimesh.util.concatenate(
-        [box((1, 1, 1), place) for place, is_there in zip(PLACES, is_cube, strict=True) if is_there]
+        [box((1, 1, 1), place) for place, is_filled in zip(PLACES, is_cube, strict=True) if is_filled]
     )
     mesh.merge_vertices()
     faces = np.roll(np.asarray(mesh.faces), -first, axis=0)
-    found = outward(np.asarray(mesh.vertices), faces, faces)
-    assert found.is_orientable and not len(found.caps)
-    cubes = trimesh.Trimesh(found.vertices, found.faces, process=False).split(only_watertight=False)
+    result = outward(np.asarray(mesh.vertices), faces, faces)
+    assert result.is_orientable and not len(result.caps)
+    cubes = trimesh.Trimesh(result.vertices, result.faces, process=False).split(only_watertight=False)
     assert sorted(cube.volume for cube in cubes) == pytest.approx([1.0] * sum(is_cube))
-    winding = winding_number(found.vertices, found.faces, np.array(PLACES, float))
+    winding = winding_number(result.vertices, result.faces, np.array(PLACES, float))
     np.testing.assert_allclose(winding, np.array(is_cube, float), atol=1e-9)
 
 
 @pytest.mark.parametrize(("hole", "is_solid"), [(0.12, True), (0.15, False), (0.5, False)])
-def test_a_sphere_with_a_hole_of_an_eighth_of_its_radius_is_solid(hole, is_solid):
-    """The squared border is π (hole / radius)² of the area: 4.5, 7 and 79 %. Only what lies in a solid is dropped."""
+def test_a_sphere_with_a_small_hole_is_solid(hole, is_solid):
+    """The squared border is π (hole / radius)² of the area: 4.5, 7 and 79 %. Only parts inside a solid are dropped."""
     polar = np.linspace(np.arcsin(hole), np.pi, 40)
     profile = 0.01 * np.stack([np.sin(polar), np.cos(polar)], axis=1)
     mesh = trimesh.creation.revolve(profile, sections=64)

@@ -1,4 +1,4 @@
-"""Regions: every sample is in them, whatever the method."""
+"""Every sample lies in its region, whatever the method."""
 
 import numpy as np
 import pytest
@@ -27,18 +27,18 @@ REGIONS = [
     [{"method": "poisson", "count": 150}, {"method": "grid", "rows": 9, "columns": 11, "direction": [0, -1, -1]}],
 )
 @pytest.mark.parametrize("parts", [*[[i] for i in range(len(REGIONS))], [1, 2, 3], [0, 1]], ids=str)
-def test_regions(keys, parts):
+def test_samples_lie_in_all_regions(keys, parts):
     surface = surface_of(ball(0.01), ball(0.01, (0.03, 0, 0)))
     regions = [REGIONS[i][0] for i in parts]
-    found = sample(surface, placement(**keys, region=regions if len(parts) > 1 else regions[0]), HERE)
-    assert len(found.pos)
+    samples = sample(surface, placement(**keys, region=regions if len(parts) > 1 else regions[0]), HERE)
+    assert len(samples.pos)
     for i in parts:
-        assert REGIONS[i][1](found.pos, found.normal).all()
+        assert REGIONS[i][1](samples.pos, samples.normal).all()
     if parts in ([3], [4]) and keys["method"] == "poisson":
-        np.testing.assert_allclose(found.area.sum(), ball(0.01).area, rtol=1e-9)
+        np.testing.assert_allclose(samples.area.sum(), ball(0.01).area, rtol=1e-9)
 
 
-def test_geoms_that_do_not_exist():
+def test_unknown_and_excluded_geoms_are_named():
     surface = surface_of(box((1, 1, 1)), box((1, 1, 1)))
     assert str(error_of(surface, placement("poisson", count=3, region={"geoms": "mesh7"}))) == (
         'no geom or mesh of this link matches "mesh7"; did you mean "mesh1"?'

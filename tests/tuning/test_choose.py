@@ -1,4 +1,4 @@
-"""What `accuracy` chooses: on states that took no part, by sensors that share an object, and what is left as written."""
+"""What `accuracy` chooses: checked on other states, for sensors that share an object, and beside values that are written."""
 
 import dataclasses
 import warnings
@@ -21,13 +21,13 @@ from tgdsl.tuning.recording import record
 
 DEPTH = "depth: {kind: contact_depth, gate: geometric, accuracy: ACC}"
 GRIDS = (1e-3, 2e-4, 5e-5, 1e-5)
-"""Tolerances of grids that are chosen among, coarse to fine [m]."""
+"""Candidate tolerances of grids, coarse to fine [m]."""
 KEYS = ("objects.stone.query", "objects.stone.tolerance")
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _kept_by_themselves(tmp_path_factory):
-    """Grids are baked once for all of these tests, and choices are not those of earlier runs; runs are short."""
+def _fresh_cache(tmp_path_factory):
+    """Use short runs and a fresh cache that all tests of this file share."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(choosing, "ENVS", 6)
         patch.setattr(choosing, "STEPS", 30)
@@ -41,10 +41,10 @@ def depth_at(accuracy: str) -> str:
 
 @pytest.fixture(scope="module")
 def others(tmp_path_factory):
-    """States of other environments than those of any choice, and what raycast in float64 reads of them."""
-    made = chosen_document(tmp_path_factory.mktemp("others"), depth_at("1 %"))
+    """Return states that no choice has seen, and their depths by raycast in float64."""
+    document = chosen_document(tmp_path_factory.mktemp("others"), depth_at("1 %"))
     changes = {"sensors.depth.accuracy": None, "objects.stone.query": "raycast"}
-    exact = tgdsl.compile(made, overrides=changes, dtype="float64")
+    exact = tgdsl.compile(document, overrides=changes, dtype="float64")
     recording = record(exact, 6, steps=45, substeps=5, seed=11)
     return recording.states, read(exact, recording.states)
 
@@ -54,15 +54,15 @@ def read(touch, states):
     return np.stack([touch(state)["depth"].double().numpy() for state in states])
 
 
-def rms(found, exact):
-    """Root mean square over what is felt, as a fraction of the largest depth: of depths the median is 0."""
+def rms(depths, exact):
+    """Return the RMS error over nonzero depths as a fraction of the largest; the median depth must be 0."""
     assert np.median(exact) == 0
-    return float(np.sqrt(((found - exact) ** 2).sum() / (exact != 0).sum()) / exact.max())
+    return float(np.sqrt(((depths - exact) ** 2).sum() / (exact != 0).sum()) / exact.max())
 
 
 @pytest.mark.slow
-def test_the_coarsest_variant_is_chosen_that_holds_the_accuracy_on_other_states(tmp_path, others):
-    """The next coarser grid, which takes fewer operations or bytes, does not hold it there; each accuracy has another variant."""
+def test_the_coarsest_accurate_variant_is_chosen(tmp_path, others):
+    """It holds the accuracy on other states, and the next coarser grid does not; each accuracy gets another variant."""
     states, exact = others
     variants = set()
     for accuracy, bound in (("10 %", 0.1), ("1 %", 0.01), ("0.01 %", 1e-4)):
@@ -70,35 +70,35 @@ def test_the_coarsest_variant_is_chosen_that_holds_the_accuracy_on_other_states(
         assert rms(read(tgdsl.compile(document), states), exact) <= bound
         changes = choose(document).changes
         variants.add(str(changes))
-        place = GRIDS.index(changes[KEYS[1]]) if changes[KEYS[0]] == "sdf" else len(GRIDS)
-        if place:
-            coarser = {"sensors.depth.accuracy": None, KEYS[1]: GRIDS[place - 1]}
+        index = GRIDS.index(changes[KEYS[1]]) if changes[KEYS[0]] == "sdf" else len(GRIDS)
+        if index:
+            coarser = {"sensors.depth.accuracy": None, KEYS[1]: GRIDS[index - 1]}
             assert rms(read(tgdsl.compile(document, overrides=coarser), states), exact) > bound
     assert len(variants) == 3
 
 
 @pytest.mark.slow
-def test_an_amount_is_held_in_its_unit(tmp_path, others):
-    """0.3 % of a depth of some 3 mm are 10 µm."""
+def test_an_absolute_accuracy_equals_its_relative_one(tmp_path, others):
+    """10 µm are 0.3 % of a depth of about 3 mm."""
     states, exact = others
-    made = chosen_document(tmp_path, depth_at("10 um"))
-    assert rms(read(tgdsl.compile(made), states), exact) * exact.max() <= 1e-5
+    document = chosen_document(tmp_path, depth_at("10 um"))
+    assert rms(read(tgdsl.compile(document), states), exact) * exact.max() <= 1e-5
     relative = choose(chosen_document(tmp_path, depth_at(f"{100 * 1e-5 / exact.max():.2g} %"))).changes
-    assert choose(made).changes == relative
+    assert choose(document).changes == relative
 
 
 @pytest.mark.slow
-def test_the_stricter_of_two_sensors_decides_on_their_object(tmp_path):
-    made = chosen_document(tmp_path, depth_at("10 %"), depth_at("0.01 %").replace("depth:", "fine:"))
-    plan = compile_plan(made)
-    assert choose(made).changes == choose(chosen_document(tmp_path, depth_at("0.01 %"))).changes
+def test_the_stricter_sensor_decides_for_a_shared_object(tmp_path):
+    document = chosen_document(tmp_path, depth_at("10 %"), depth_at("0.01 %").replace("depth:", "fine:"))
+    plan = compile_plan(document)
+    assert choose(document).changes == choose(chosen_document(tmp_path, depth_at("0.01 %"))).changes
     assert any("object stone: as fine as fine needs" in line for line in plan.sensors[0].notes)
     assert len(plan.quantities["contact_depth"].queries) == 1
 
 
 @pytest.mark.slow
-def test_sensors_without_an_accuracy_keep_what_they_have(tmp_path):
-    """What nobody wrote is 0.05 mm."""
+def test_sensors_without_an_accuracy_keep_their_tolerance(tmp_path):
+    """The default tolerance is 0.05 mm."""
     plain = "plain: {kind: contact_depth, gate: geometric}"
     assert choose(chosen_document(tmp_path, depth_at("10 %"), plain)).changes[KEYS[1]] == 5e-5
     alone = choose(chosen_document(tmp_path, depth_at("10 %"), plain), sensors=["depth"])
@@ -106,28 +106,28 @@ def test_sensors_without_an_accuracy_keep_what_they_have(tmp_path):
 
 
 @pytest.mark.slow
-def test_what_is_written_stays(tmp_path):
-    made = chosen_document(tmp_path, depth_at("10 %"), object=", tolerance: 0.02 mm")
-    assert choose(made).changes == {}
-    assert "left as written: objects.stone.tolerance" in tgdsl.compile(made).explain()
-    made = chosen_document(tmp_path, depth_at("10 %"))
-    assert choose(made, {KEYS[0]: "sdf"}).changes[KEYS[1]] == 1e-3
+def test_written_values_stay(tmp_path):
+    document = chosen_document(tmp_path, depth_at("10 %"), object=", tolerance: 0.02 mm")
+    assert choose(document).changes == {}
+    assert "left as written: objects.stone.tolerance" in tgdsl.compile(document).explain()
+    document = chosen_document(tmp_path, depth_at("10 %"))
+    assert choose(document, {KEYS[0]: "sdf"}).changes[KEYS[1]] == 1e-3
 
 
 @pytest.mark.slow
-def test_imperfections_change_nothing_of_it(tmp_path):
+def test_imperfections_do_not_change_the_choice(tmp_path):
     bare = choose(chosen_document(tmp_path, depth_at("1 %"))).changes
-    more = ", noise: noisy, rate: 50 Hz, history: 3, readout: both"
-    made = chosen_document(tmp_path, depth_at("1 %").replace(", accuracy", f"{more}, accuracy"))
-    assert choose(made).changes == bare
-    touch = tgdsl.compile(made)
+    imperfections = ", noise: noisy, rate: 50 Hz, history: 3, readout: both"
+    document = chosen_document(tmp_path, depth_at("1 %").replace(", accuracy", f"{imperfections}, accuracy"))
+    assert choose(document).changes == bare
+    touch = tgdsl.compile(document)
     assert [output.name for output in touch.outputs] == ["depth", "depth/clean"]
     assert sum("accuracy 1 %" in line for sensor in touch.plan.sensors for line in sensor.notes) == 1
 
 
 @pytest.mark.slow
 def test_fields_and_distances_are_chosen_together(tmp_path):
-    """Newton steps, 4 if nobody writes them, and how the mesh is asked."""
+    """Newton steps (4 by default) and the mesh query."""
     choice = choose(chosen_document(tmp_path, "force: {kind: force_taxel, gate: geometric, accuracy: 5 %}"))
     assert choice.changes[KEYS[0]] == "sdf" and choice.changes["sensors.force.moment_iterations"] < 4
     assert any("against 16 Newton steps, raycast in float64" in line for line in choice.notes["force"])
@@ -144,57 +144,61 @@ def forget_choices():
 
 @pytest.mark.slow
 def test_the_same_document_gives_the_same_bytes(tmp_path, monkeypatch):
-    """With the choice in the cache, and without."""
-    made, found = chosen_document(tmp_path, depth_at("1 %")), []
+    """With and without the choice in the cache."""
+    document, plans = chosen_document(tmp_path, depth_at("1 %")), []
     for name in ("one", "two", "three"):
         if name == "two":
             forget_choices()
         elif name == "three":
-            monkeypatch.setattr(choosing, "record", None)  # nothing is run again
-        save_plan(compile_plan(made), tmp_path / f"{name}.safetensors")
-        found.append((tmp_path / f"{name}.safetensors").read_bytes())
-    assert found[0] == found[1] == found[2]
+            monkeypatch.setattr(choosing, "record", None)  # nothing may run again
+        save_plan(compile_plan(document), tmp_path / f"{name}.safetensors")
+        plans.append((tmp_path / f"{name}.safetensors").read_bytes())
+    assert plans[0] == plans[1] == plans[2]
     assert "accuracy 1 %: grid" in tgdsl.load(tmp_path / "one.safetensors").explain()
 
 
 @pytest.mark.slow
 def test_the_origin_is_the_document_as_written(tmp_path):
-    made = chosen_document(tmp_path, depth_at("10 %"))
-    unchosen = pipeline.compile_document(made, choice=Choice(notes={"depth": ()})).plan
-    assert compile_plan(made).origin == unchosen.origin
+    document = chosen_document(tmp_path, depth_at("10 %"))
+    unchosen = pipeline.compile_document(document, choice=Choice(notes={"depth": ()})).plan
+    assert compile_plan(document).origin == unchosen.origin
 
 
 @pytest.mark.slow
-def test_a_choice_follows_from_what_the_document_says(tmp_path):
-    """Another mass changes the motion, not what is computed of it; still it is looked at again."""
-    made = chosen_document(tmp_path, depth_at("1 %"))
+def test_keys_of_choices_depend_on_document_and_scene(tmp_path):
+    """Another mass changes only the motion; the key changes too."""
+    document = chosen_document(tmp_path, depth_at("1 %"))
     keys = set()
-    for text in (made.read_text(), made.read_text().replace("1 %", "2 %"), made.read_text().replace("radius: 4", "radius: 3")):
-        made.write_text(text)
-        task = choosing.task_of(made)
+    for text in (
+        document.read_text(),
+        document.read_text().replace("1 %", "2 %"),
+        document.read_text().replace("radius: 4", "radius: 3"),
+    ):
+        document.write_text(text)
+        task = choosing.task_of(document)
         keys.add(choosing.key_of(task))
-    scene = made.parent / "scene.xml"
+    scene = document.parent / "scene.xml"
     scene.write_text(scene.read_text().replace('mass=".25"', 'mass=".3"'))
-    keys.add(choosing.key_of(choosing.task_of(made)))
+    keys.add(choosing.key_of(choosing.task_of(document)))
     assert len(keys) == 4
 
 
-def test_all_variants_of_objects_choose_and_verify():
-    """Environment i begins with variant i modulo their number."""
+def test_both_halves_have_all_variants_of_objects():
+    """Environment i starts with variant i modulo their number."""
     for num in (1, 2, 3, 5, 8):
         for half in halves(max(16, 2 * num)):
             assert set(np.arange(max(16, 2 * num))[half] % num) == set(range(num))
 
 
-def test_a_compiler_without_a_simulator_refuses_it(tmp_path):
+def test_a_compiler_without_a_simulator_refuses_accuracy(tmp_path):
     with pytest.raises(TgdslError, match=r"pad\.yaml: depth: `accuracy` takes a run of the scene"):
         pipeline.compile_document(chosen_document(tmp_path, depth_at("1 %")))
 
 
-def place_of(document, text):
-    """Return line and column of a text in a document."""
+def location_of(document, text):
+    """Return `file:line:column` of a text in a document."""
     lines = document.read_text().splitlines()
-    line = next(i for i, own in enumerate(lines) if text in own)
+    line = next(i for i, content in enumerate(lines) if text in content)
     return f"{document}:{line + 1}:{lines[line].index(text) + 1}"
 
 
@@ -231,57 +235,57 @@ def place_of(document, text):
         ),
     ],
 )
-def test_what_is_wrong_is_told_where_it_stands(tmp_path, sensor, at, message):
-    made = chosen_document(tmp_path, sensor)
+def test_wrong_accuracies_are_located_in_the_document(tmp_path, sensor, at, message):
+    document = chosen_document(tmp_path, sensor)
     with pytest.raises(SpecError) as caught:
-        tgdsl.compile(made)
+        tgdsl.compile(document)
     (problem,) = caught.value.problems
-    assert str(problem).startswith(f"{place_of(made, at)}: ") and message.split("; did")[0] in str(problem)
+    assert str(problem).startswith(f"{location_of(document, at)}: ") and message.split("; did")[0] in str(problem)
 
 
 @pytest.mark.slow
-def test_what_nothing_holds_names_the_best(tmp_path):
-    made = chosen_document(tmp_path, depth_at("0.01 %"), object=", query: sdf")
+def test_an_unreachable_accuracy_names_the_best_variant(tmp_path):
+    document = chosen_document(tmp_path, depth_at("0.01 %"), object=", query: sdf")
     with pytest.raises(SpecError) as caught:
-        tgdsl.compile(made)
+        tgdsl.compile(document)
     (problem,) = caught.value.problems
     assert str(problem).startswith(
-        f"{place_of(made, '0.01 %')}: sensors.depth.accuracy: nothing that is free to choose holds 0.01 %"
+        f"{location_of(document, '0.01 %')}: sensors.depth.accuracy: nothing that is free to choose holds 0.01 %"
     )
     assert "best: grid, 0.01 mm, RMS error of depth 0.0" in problem.what
     assert problem.hint == "objects.stone.query stays as written; errors are against raycast"
 
 
 def test_a_reading_that_never_changes_has_no_error(tmp_path):
-    made = chosen_document(tmp_path, depth_at("1 %"))
-    scene = made.parent / "scene.xml"
+    document = chosen_document(tmp_path, depth_at("1 %"))
+    scene = document.parent / "scene.xml"
     text = scene.read_text().replace('timestep="0.002"', 'timestep="0.002" gravity="0 0 0"')
     scene.write_text(text.replace('pos="0 0 .0305"', 'pos="0 0 .5"').replace('ctrl="-5 .05"', 'ctrl="5 .05"'))
     with pytest.raises(SpecError) as caught:
-        tgdsl.compile(made)
+        tgdsl.compile(document)
     (problem,) = caught.value.problems
     assert problem.what.startswith("its depth never changes on these states (scripted run: ")
 
 
 def test_a_scene_that_cannot_be_run_has_no_states(tmp_path):
-    made = chosen_document(tmp_path, depth_at("1 %"))
-    scene = made.parent / "scene.xml"
+    document = chosen_document(tmp_path, depth_at("1 %"))
+    scene = document.parent / "scene.xml"
     scene.write_text(scene.read_text().replace('timestep="0.002"', 'timestep="0.002" integrator="RK4"'))
     with pytest.raises(SpecError, match=r"sensors\.depth\.accuracy: there are no states to measure errors on: .*RK4"):
-        tgdsl.compile(made)
+        tgdsl.compile(document)
 
 
 @pytest.mark.slow
-def test_without_anything_finer_nothing_is_known_of_an_error(tmp_path, monkeypatch):
-    """Without Warp a grid of 0.01 mm is the finest: others are measured against it, itself it cannot be chosen."""
+def test_the_finest_variant_cannot_be_chosen(tmp_path, monkeypatch):
+    """Without Warp, a grid of 0.01 mm is the reference of all others, so its own error is unknown."""
 
-    def none() -> None:
+    def without_warp() -> None:
         raise TgdslError("distances to meshes need NVIDIA Warp")
 
-    monkeypatch.setattr("tgdsl.geometry.bvh._warp", none)
+    monkeypatch.setattr("tgdsl.geometry.bvh._warp", without_warp)
     forget_choices()
-    made = chosen_document(tmp_path, depth_at("1 %"))
-    assert choose(made).changes[KEYS[1]] == 2e-4
+    document = chosen_document(tmp_path, depth_at("1 %"))
+    assert choose(document).changes[KEYS[1]] == 2e-4
     forget_choices()
     with pytest.raises(SpecError, match=r"best: grid, 0\.05 mm, .*raycast is not available: .*NVIDIA Warp"):
         choose(chosen_document(tmp_path, depth_at("0.01 %")))
@@ -290,18 +294,18 @@ def test_without_anything_finer_nothing_is_known_of_an_error(tmp_path, monkeypat
 
 
 @pytest.mark.slow
-def test_the_document_is_warned_of_once(tmp_path):
-    made = chosen_document(tmp_path, depth_at("10 %").replace(", accuracy", ", rate: 0.05, accuracy"))
-    with warnings.catch_warnings(record=True) as found:
+def test_warnings_of_the_document_appear_once(tmp_path):
+    document = chosen_document(tmp_path, depth_at("10 %").replace(", accuracy", ", rate: 0.05, accuracy"))
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        tgdsl.compile(made)
-    assert [str(own.message).count("usually at least 0.1 Hz") for own in found] == [1]
+        tgdsl.compile(document)
+    assert [str(warning.message).count("usually at least 0.1 Hz") for warning in caught] == [1]
 
 
-def test_a_choice_is_kept_as_it_is(tmp_path):
+def test_packed_choices_unpack_unchanged(tmp_path):
     choice = Choice({"objects.a.tolerance": 1e-3, "sensors.b.operator": None}, {"b": ("one", "  zwei, ≤")})
-    again = choosing.unpacked(choosing.packed(choice))
-    assert dataclasses.asdict(again) == dataclasses.asdict(choice)
+    unpacked = choosing.unpacked(choosing.packed(choice))
+    assert dataclasses.asdict(unpacked) == dataclasses.asdict(choice)
 
 
 SOUND = """
@@ -316,31 +320,31 @@ SOUND = """
 RUNG = [{"frequency": 523.0, "decay": 6.0, "gain": 2.0}, {"frequency": 2903.0, "decay": 55.0, "gain": 1.0}]
 
 
-def sounding(tmp_path, **sensor):
+def sounding_document(tmp_path, **sensor):
     (tmp_path / "sound.xml").write_text(SOUND)
-    given = {"kind": "contact_audio", "links": "plate", "feels": ["ball"], "modes": RUNG, "scrape": 0, "samples": 16, **sensor}
+    merged = {"kind": "contact_audio", "links": "plate", "feels": ["ball"], "modes": RUNG, "scrape": 0, "samples": 16, **sensor}
     return {
         "tgdsl": 1,
         "robot": {"model": str(tmp_path / "sound.xml")},
         "objects": {"ball": {"body": "ball"}},
-        "sensors": {"s": given},
+        "sensors": {"s": merged},
     }
 
 
-def test_modes_of_a_sound_are_chosen_by_their_part_of_it(tmp_path):
-    """The quiet mode begins with half of the loud one's amplitude and decays within the run: 1 % needs both, 50 % not.
+def test_modes_are_chosen_by_their_share_of_the_sound(tmp_path):
+    """The quiet mode starts at half of the loud one's amplitude and decays within the run: 1 % needs both, 50 % one.
 
-    Written, one mode stays, and its error is against both: too large.
+    A single mode that is written stays, and its error against both is too large.
     """
     for accuracy, modes in (("1 %", 2), ("50 %", 1)):
-        touch = tgdsl.compile(sounding(tmp_path, accuracy=accuracy))
+        touch = tgdsl.compile(sounding_document(tmp_path, accuracy=accuracy))
         assert touch.plan.sensors[0].constants["frequency"].shape == (1, modes)
     with pytest.raises(SpecError, match=r"sensors\.s\.accuracy: nothing that is free to choose holds 1 %"):
-        tgdsl.compile(sounding(tmp_path, accuracy="1 %", loudest=1))
+        tgdsl.compile(sounding_document(tmp_path, accuracy="1 %", loudest=1))
 
 
-def test_states_are_recorded_at_the_steps_that_a_sensor_wants(tmp_path):
-    """One physics step per call: 16 samples of 1 ms, of which no mode is dropped; the run lasts as long as with five."""
-    touch = tgdsl.compile(sounding(tmp_path))
+def test_states_are_recorded_at_the_steps_of_the_sensor(tmp_path):
+    """One physics step per call: 16 samples of 1 ms; the run lasts as long as with five, and no mode is dropped."""
+    touch = tgdsl.compile(sounding_document(tmp_path))
     recording = record(touch, 2, steps=10)
     assert {state.dt for state in recording.states} == {0.001} and len(recording.states) == 50

@@ -1,4 +1,4 @@
-"""A whole bench of a small scene: errors by other means, the same twice, and what is refused."""
+"""A whole bench of a small scene: independent errors, repeatability and refused requests."""
 
 import csv
 import json
@@ -37,7 +37,7 @@ def report(work):
 
 
 @pytest.mark.slow
-def test_every_subject_has_three_points_and_one_is_taken_now(report):
+def test_every_subject_has_three_points_and_one_current(report):
     assert [subject.name for subject in report.subjects] == ["depth", "skin", "physics"]
     for subject in report.subjects:
         assert len(subject.points) >= 3 and sum(point.is_own for point in subject.points) == 1
@@ -45,8 +45,8 @@ def test_every_subject_has_three_points_and_one_is_taken_now(report):
 
 
 @pytest.mark.slow
-def test_errors_are_those_of_the_readings_themselves(report, folder):
-    """Float32 against float64, and bfloat16, from the recorded states with nothing but compiled modules."""
+def test_errors_equal_those_of_compiled_modules(report, folder):
+    """Float32 and bfloat16 against float64, recomputed from the recorded states."""
     recording = load_recording(folder / "states.npz")
     change = {"observations": "{}"}
     with warnings.catch_warnings():
@@ -54,27 +54,27 @@ def test_errors_are_those_of_the_readings_themselves(report, folder):
         touches = [
             tgdsl.compile(folder / "pad.yaml", sensors=["depth"], overrides=change, dtype=d) for d in ("float64", "float32")
         ]
-    exact, found = (torch.stack([t(s)["depth"].double() for s in recording.for_module(t.inputs)])[:, :2] for t in touches)
-    whole = torch.stack([touches[0](s)["depth"] for s in recording.for_module(touches[0].inputs)])
-    scale = (whole - whole.flatten().median()).abs().max()
+    exact, rough = (torch.stack([t(s)["depth"].double() for s in recording.for_module(t.inputs)])[:, :2] for t in touches)
+    readings = torch.stack([touches[0](s)["depth"] for s in recording.for_module(touches[0].inputs)])
+    scale = (readings - readings.flatten().median()).abs().max()
     assert scale > 1e-3
     depth = report.subjects[0]
-    assert depth.own.chosen.largest.value == pytest.approx(float((found - exact).abs().max() / scale), rel=1e-9)
+    assert depth.own.chosen.largest.value == pytest.approx(float((rough - exact).abs().max() / scale), rel=1e-9)
     rounded = next(point for point in depth.points if point.precision == "bfloat16 readings")
     assert rounded.chosen.largest.value == pytest.approx(
-        float((found.bfloat16().double() - exact).abs().max() / scale), rel=1e-9
+        float((rough.bfloat16().double() - exact).abs().max() / scale), rel=1e-9
     )
     assert 1e-9 < depth.own.chosen.largest.value < 1e-5 < rounded.chosen.largest.value < 2**-8
 
 
 @pytest.mark.slow
-def test_the_definition_agrees_with_what_errors_are_measured_against(report):
+def test_the_definition_agrees_with_the_reference(report):
     assert float(report.subjects[0].check.split(" by ")[1].split()[0]) < 1e-12
 
 
 @pytest.mark.slow
 def test_a_truncated_operator_is_off_by_about_its_tolerance(report):
-    """Relative errors of the matrix bound those of what it makes, up to the loads' conditioning."""
+    """Relative errors of the matrix bound those of its products, up to the loads' conditioning."""
     errors = {point.label: point.chosen.rms.value for point in report.subjects[1].points if point.precision == "float32"}
     assert errors["svd, 10 %"] < 1.0 and errors["svd, 1 %"] < 0.1
     assert errors["dense"] < 1e-5
@@ -82,22 +82,22 @@ def test_a_truncated_operator_is_off_by_about_its_tolerance(report):
 
 
 @pytest.mark.slow
-def test_times_are_of_all_numbers_of_environments(report):
+def test_every_number_of_environments_is_timed(report):
     assert all(set(point.times) == {3, 5} for subject in report.subjects[:2] for point in subject.points)
 
 
 @pytest.mark.slow
-def test_counted_bytes_are_those_of_the_tensors(report):
-    """16 taxels of a number each: 64 bytes in float32; a sensor without imperfections and shear remembers nothing."""
-    own, exact, short = report.subjects[0].points
-    assert (own.cost.output, exact.cost.output, short.cost.output) == (64, 128, 32)
-    assert own.cost.state == report.subjects[1].own.cost.state == 0
+def test_counted_bytes_match_the_tensors(report):
+    """16 taxels of one number: 64 bytes in float32; a sensor without imperfections and shear has no state."""
+    single, double, half = report.subjects[0].points
+    assert (single.cost.output, double.cost.output, half.cost.output) == (64, 128, 32)
+    assert single.cost.state == report.subjects[1].own.cost.state == 0
 
 
 @pytest.mark.slow
 def test_two_runs_agree_on_errors_exactly(work, report):
-    again = bench(Bench(work.document, states=work.save_states, sensors=("skin",), options=FEW))
-    for one, two in zip(report.subjects[1].points, again.subjects[0].points, strict=True):
+    repeated = bench(Bench(work.document, states=work.save_states, sensors=("skin",), options=FEW))
+    for one, two in zip(report.subjects[1].points, repeated.subjects[0].points, strict=True):
         assert (one.chosen, one.verified, one.cost) == (two.chosen, two.verified, two.cost)
     physics = bench(Bench(work.document, sensors=("physics",), state_envs=4, steps=9, options=FEW)).subjects[0]
     assert [p.chosen for p in physics.points] == [p.chosen for p in report.subjects[2].points]
@@ -129,26 +129,26 @@ def test_the_page_opens_offline(report, folder):
     assert len(identifiers) == len(set(identifiers))
     with files[".csv"].open() as file:
         rows = list(csv.DictReader(file))
-    told = json.loads(files[".json"].read_text())
-    assert len(rows) == len(told["rows"]) == len(list(rows_of(report)))
-    assert float(rows[0]["rms"]) == told["rows"][0]["rms"] == report.subjects[0].points[0].chosen.rms.value
+    content = json.loads(files[".json"].read_text())
+    assert len(rows) == len(content["rows"]) == len(list(rows_of(report)))
+    assert float(rows[0]["rms"]) == content["rows"][0]["rms"] == report.subjects[0].points[0].chosen.rms.value
 
 
 @pytest.mark.slow
-def test_states_that_are_saved_are_those_that_are_loaded(folder, work, report, tmp_path):
+def test_saved_states_load_unchanged(folder, work, report, tmp_path):
     touch = tgdsl.compile(work.document, overrides={"observations": "{}"})
     recording = record(touch, 3, steps=6)
     save_recording(recording, tmp_path / "s.npz")
-    again = load_recording(tmp_path / "s.npz")
-    for one, two in zip(recording.for_module(touch.inputs), again.for_module(touch.inputs), strict=True):
+    loaded = load_recording(tmp_path / "s.npz")
+    for before_saving, after_loading in zip(recording.for_module(touch.inputs), loaded.for_module(touch.inputs), strict=True):
         for name in touch.inputs.fields:
-            assert name == "dt" or torch.equal(getattr(one, name), getattr(two, name))
-        assert one.dt == two.dt
+            assert name == "dt" or torch.equal(getattr(before_saving, name), getattr(after_loading, name))
+        assert before_saving.dt == after_loading.dt
 
 
 @pytest.mark.slow
 def test_narrowed_states_read_the_same(work):
-    """A module of one sensor reads of states of all what the module of all reads."""
+    """A module of one sensor reads the same from the states as the module of all sensors."""
     everything = tgdsl.compile(work.document, overrides={"observations": "{}"}, dtype="float64")
     recording = record(everything, 2, steps=6)
     alone = tgdsl.compile(work.document, overrides={"observations": "{}"}, sensors=["depth"], dtype="float64")
@@ -157,13 +157,13 @@ def test_narrowed_states_read_the_same(work):
     )
 
 
-def test_controls_differ_between_environments_and_stay_within_their_range():
+def test_varied_controls_differ_between_environments_within_their_range():
     controls, ranges = np.linspace([0.0, 0.0], [1.0, 5.0], 7), np.array([[0.0, 1.0], [0.0, 0.0]])
-    found = varied(controls, ranges, 6, seed=0)
-    np.testing.assert_array_equal(found[:, 0], controls)
-    assert found[..., 0].min() >= 0 and found[..., 0].max() <= 1
-    assert len(np.unique(found[-1], axis=0)) == 6
-    np.testing.assert_array_equal(found, varied(controls, ranges, 6, seed=0))
+    samples = varied(controls, ranges, 6, seed=0)
+    np.testing.assert_array_equal(samples[:, 0], controls)
+    assert samples[..., 0].min() >= 0 and samples[..., 0].max() <= 1
+    assert len(np.unique(samples[-1], axis=0)) == 6
+    np.testing.assert_array_equal(samples, varied(controls, ranges, 6, seed=0))
 
 
 @pytest.mark.slow
@@ -177,7 +177,7 @@ def test_controls_differ_between_environments_and_stay_within_their_range():
         ({"state_envs": 1}, "1 environments of 90 steps: expected at least 2, and at least one step"),
     ],
 )
-def test_what_cannot_be_measured_is_refused(work, wrong, message):
+def test_unmeasurable_requests_are_refused(work, wrong, message):
     with pytest.raises(TgdslError) as caught:
         bench(Bench(work.document, **wrong))
     assert str(caught.value) == message
@@ -193,7 +193,7 @@ def test_states_of_another_document_are_refused(work, report, tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"no zip", None])
-def test_files_that_are_no_states_are_refused(tmp_path, content):
+def test_files_without_states_are_refused(tmp_path, content):
     path = tmp_path / "s.npz"
     if content is None:
         np.savez(path, ctrl=np.zeros(3))
@@ -204,7 +204,7 @@ def test_files_that_are_no_states_are_refused(tmp_path, content):
 
 
 @pytest.mark.slow
-def test_a_field_that_is_missing_is_told(work, report):
+def test_a_missing_field_is_named(work, report):
     touch = tgdsl.compile(work.document, overrides={"observations": "{}"})
     recording = load_recording(work.save_states)
     recording.states[0].contact_found = None
@@ -218,12 +218,12 @@ BLOCKS = (
 
 
 def test_sensors_that_read_blocks_do_not_change_the_physics(tmp_path):
-    """Though other time steps than theirs are tried."""
+    """Even though the bench tries other time steps than theirs."""
     path = bench_document(tmp_path)
     text = path.read_text()
-    found = []
+    results = []
     for document in (text, text.replace("observations:", f"{BLOCKS}\nobservations:")):
         path.write_text(document)
         subject = bench(Bench(path, sensors=("physics",), state_envs=4, steps=9, options=FEW)).subjects[0]
-        found.append([point.chosen for point in subject.points])
-    assert found[0] == found[1]
+        results.append([point.chosen for point in subject.points])
+    assert results[0] == results[1]

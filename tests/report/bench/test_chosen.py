@@ -13,17 +13,17 @@ from tgdsl.tuning import choose as choosing
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bench")
-    made = chosen_document(folder, "depth: {kind: contact_depth, gate: geometric, accuracy: 10 %}")
+    document = chosen_document(folder, "depth: {kind: contact_depth, gate: geometric, accuracy: 10 %}")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(choosing, "ENVS", 6)
         patch.setattr(choosing, "STEPS", 30)
         patch.setenv("TGDSL_CACHE", str(folder / "cache"))
-        work = Bench(made, sensors=("depth",), state_envs=4, steps=9, options=Options(num_envs=(2,), repeats=1))
+        work = Bench(document, sensors=("depth",), state_envs=4, steps=9, options=Options(num_envs=(2,), repeats=1))
         yield bench(work)
 
 
 @pytest.mark.slow
-def test_what_accuracy_chose_is_what_the_compiler_takes_now(report):
+def test_the_current_point_is_the_one_that_accuracy_chose(report):
     (depth,) = report.subjects
     assert depth.own.label == "grid, 1 mm" and depth.reference == "raycast, float64"
     assert depth.chosen[0] == "accuracy 10 %: grid, 1 mm"
@@ -32,7 +32,7 @@ def test_what_accuracy_chose_is_what_the_compiler_takes_now(report):
 
 
 @pytest.mark.slow
-def test_files_say_why(report, tmp_path):
+def test_files_give_the_reason_of_the_choice(report, tmp_path):
     files = {file.suffix: file.read_text() for file in write_bench(report, tmp_path)}
     assert "accuracy 10 %: grid, 1 mm<br>" in files[".html"]
     assert json.loads(files[".json"])["subjects"][0]["chosen"][0] == "accuracy 10 %: grid, 1 mm"

@@ -1,4 +1,4 @@
-"""The front of points with intervals, by points placed by hand, and medians by order statistics."""
+"""The Pareto front of hand-placed points with intervals, and intervals of medians."""
 
 import numpy as np
 import pytest
@@ -11,18 +11,18 @@ def point(time, error, half=0.1):
     return tuple(Interval(value, value - half, value + half) for value in (time, error))
 
 
-def test_points_far_apart():
-    """(1, 3) and (3, 1) are the front; (3, 3) is worse than both in something and better in nothing."""
+def test_front_of_points_far_apart():
+    """(1, 3) and (3, 1) are the front; both dominate (3, 3)."""
     assert front_of([point(1, 3), point(3, 1), point(3, 3)]) == [True, True, False]
 
 
 def test_overlapping_points_are_equal():
-    """Errors of 1.0 ± 0.1 and 1.15 ± 0.1 overlap: only time tells them apart, and the slower one is off the front."""
+    """Errors of 1.0 ± 0.1 and 1.15 ± 0.1 overlap, so the slower point is off the front."""
     assert front_of([point(1, 1.15), point(2, 1.0)]) == [True, False]
     assert front_of([point(1, 1.15), point(1.15, 1.0)]) == [True, True]
 
 
-def test_touching_intervals_overlap_and_apart_ones_do_not():
+def test_touching_intervals_overlap():
     low, high = Interval(1.0, 0.5, 1.5), Interval(2.0, 1.5, 2.5)
     assert low.overlaps(high) and high.overlaps(low)
     assert not low.overlaps(Interval(2.0, 1.6, 2.5))
@@ -33,12 +33,12 @@ def test_a_point_does_not_dominate_itself_or_its_equal():
     assert front_of([point(1, 1)] * 2) == [True, True]
 
 
-def test_two_equal_points_are_both_beaten_by_a_third():
+def test_one_point_can_dominate_two_equal_ones():
     assert front_of([point(2, 2), point(2.1, 2.1), point(1, 1)]) == [False, False, True]
 
 
 @pytest.mark.parametrize(("count", "low", "high"), [(1, 1, 1), (5, 1, 5), (6, 1, 6), (9, 2, 8), (15, 4, 12), (20, 6, 15)])
-def test_intervals_of_medians_are_those_of_the_tables(count, low, high):
-    """Ranks of the 95 % interval of a median, as tables of the sign test have them (e.g. 2 and 8 of nine)."""
+def test_intervals_of_medians_match_published_tables(count, low, high):
+    """Ranks of the 95 % interval of a median, from tables of the sign test (e.g. 2 and 8 of nine)."""
     times = np.random.default_rng(0).permutation(np.arange(1.0, count + 1))
     assert median_of(times) == Interval((count + 1) / 2, low, high)
