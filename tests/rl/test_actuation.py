@@ -1,4 +1,4 @@
-"""Drives against closed forms of one hinge without gravity: what each imperfection does is seen in how the joint moves."""
+"""Drives against closed forms of one hinge without gravity: each imperfection shows in the joint's motion."""
 
 import mujoco
 import numpy as np
@@ -52,7 +52,7 @@ def hinge(tmp_path, simulator, num_envs=1, kv=0.0, passive=0.0, substeps=1, driv
 
 
 def begin(actuation, chosen, episode, at_controls=False):
-    """Begin episodes, as environments whose drives are random do."""
+    """Begin episodes as an environment with randomised drives does."""
     actuation.draw(chosen, episode)
     actuation.reset(chosen, episode, at_controls)
 
@@ -83,7 +83,7 @@ AT_REST = [
     ("simulator", "drive", "expected"),
     [*((BatchSimulation, *case) for case in AT_REST), (warp, *AT_REST[0]), (warp, *AT_REST[1])],
 )
-def test_the_torque_at_rest_is_seen_in_the_acceleration(tmp_path, simulator, drive, expected):
+def test_the_torque_at_rest_sets_the_acceleration(tmp_path, simulator, drive, expected):
     sim, actuation = hinge(tmp_path, simulator, drive=drive)
     actuation.command(targets(sim, 0.1))
     sim.step()
@@ -93,14 +93,14 @@ def test_the_torque_at_rest_is_seen_in_the_acceleration(tmp_path, simulator, dri
 
 
 @pytest.mark.parametrize(("strength", "expected"), [(1.0, LIMIT), (1.1, 1.1 * LIMIT), (0.5, 0.5 * LIMIT)])
-def test_the_stall_torque_is_the_one_that_was_drawn(tmp_path, strength, expected):
+def test_the_stall_torque_is_the_drawn_one(tmp_path, strength, expected):
     sim, actuation = hinge(tmp_path, BatchSimulation, drive=DriveSpec(strength=(strength, strength)))
     actuation.command(targets(sim, -1.9))
     sim.step()
     assert acceleration(sim) == pytest.approx(-expected / INERTIA, rel=1e-5)
 
 
-def test_neither_kick_nor_noise_is_beyond_the_strength(tmp_path):
+def test_kick_and_noise_stay_within_the_strength(tmp_path):
     drive = DriveSpec(strength=(0.9, 0.9), kick=(1.2, 1.2), torque_noise=0.5)
     sim, actuation = hinge(tmp_path, BatchSimulation, drive=drive)
     actuation.command(targets(sim, -1.9))
@@ -112,7 +112,7 @@ def test_neither_kick_nor_noise_is_beyond_the_strength(tmp_path):
     assert min(torques) == pytest.approx(-0.9 * LIMIT) and max(torques) > -0.7 * LIMIT
 
 
-def test_a_target_beyond_the_joints_range_is_reached_by_bias_all_the_same(tmp_path):
+def test_bias_moves_the_target_beyond_the_joints_range(tmp_path):
     sim, actuation = hinge(tmp_path, BatchSimulation, drive=DriveSpec(bias=(0.05, 0.05)))
     sim.set_state(qpos=np.array([1.98]))
     actuation.place(torch.tensor([True]))
@@ -121,7 +121,7 @@ def test_a_target_beyond_the_joints_range_is_reached_by_bias_all_the_same(tmp_pa
     assert acceleration(sim) == pytest.approx(STIFFNESS * 0.07 / INERTIA, rel=1e-4)
 
 
-def test_kick_acts_at_rest_alone(tmp_path):
+def test_kick_acts_only_at_rest(tmp_path):
     sim, actuation = hinge(tmp_path, BatchSimulation, drive=DriveSpec(kick=(1.5, 1.5)))
     actuation.command(targets(sim, 0.1))
     speeds = [0.0]
@@ -130,13 +130,13 @@ def test_kick_acts_at_rest_alone(tmp_path):
         sim.step()
         speeds.append(float(sim.qvel[0, 0]))
         factor = 1.5 if abs(speeds[-2]) < BREAKAWAY_SPEED else 1.0
-        wanted = factor * STIFFNESS * (0.1 - position) / INERTIA * DT
-        assert speeds[-1] - speeds[-2] == pytest.approx(wanted, rel=2e-4)
+        expected = factor * STIFFNESS * (0.1 - position) / INERTIA * DT
+        assert speeds[-1] - speeds[-2] == pytest.approx(expected, rel=2e-4)
     assert abs(speeds[1]) < BREAKAWAY_SPEED < abs(speeds[-1])
 
 
 def test_backlash_is_crossed_at_each_reversal(tmp_path):
-    """The joint, damped so that it never overshoots, follows a target up, rests while it crosses the play, and follows it down."""
+    """A joint without overshoot follows the target up, rests while it crosses the play, then follows it down."""
     sim, actuation = hinge(tmp_path, BatchSimulation, kv=0.3, drive=DriveSpec(backlash=(0.2, 0.2)), substeps=160)
     ends = []
     for target in (0.5, 0.31, 0.0, 0.2, 0.3):
@@ -172,30 +172,30 @@ def test_the_largest_torque_falls_to_zero_at_top_speed(tmp_path, simulator):
     assert float(sim.qvel[0, 0]) == pytest.approx(expected, rel=1e-4)
 
 
-def test_the_robots_own_top_speed_is_torque_over_damping(tmp_path):
+def test_the_robots_top_speed_is_torque_over_damping(tmp_path):
     sim, actuation = hinge(tmp_path, BatchSimulation, passive=0.125, drive=DriveSpec(top_speed="robot"))
     actuation.command(targets(sim, 1.9))
     sim.step()
-    moving = float(sim.qvel[0, 0])
+    speed = float(sim.qvel[0, 0])
     sim.step()
-    assert float(actuation.torque[0, 0]) == pytest.approx(LIMIT * (1 - moving / 4.0), rel=1e-9)
+    assert float(actuation.torque[0, 0]) == pytest.approx(LIMIT * (1 - speed / 4.0), rel=1e-9)
 
 
-def test_an_ideal_drive_is_the_robots_actuator_to_the_bit(tmp_path):
+def test_an_ideal_drive_equals_the_robots_actuator(tmp_path):
     sim, actuation = hinge(tmp_path, BatchSimulation, kv=0.05, substeps=5)
     assert actuation.is_ideal and sim.drive is None
-    plain = mujoco.MjData(sim.model)
+    data = mujoco.MjData(sim.model)
     for step in range(20):
-        wanted = 0.7 * np.sin(step)
-        actuation.command(torch.full((1, 1), wanted / 2, dtype=torch.float64))
+        target = 0.7 * np.sin(step)
+        actuation.command(torch.full((1, 1), target / 2, dtype=torch.float64))
         sim.step()
-        plain.ctrl[0] = wanted
-        mujoco.mj_step(sim.model, plain, 5)
-    assert float(sim.qpos[0, 0]) == pytest.approx(plain.qpos[0], abs=1e-14)
+        data.ctrl[0] = target
+        mujoco.mj_step(sim.model, data, 5)
+    assert float(sim.qpos[0, 0]) == pytest.approx(data.qpos[0], abs=1e-14)
 
 
 @BOTH
-def test_a_drive_that_does_nothing_else_moves_as_the_robots_actuator(tmp_path, simulator):
+def test_a_drive_with_negligible_noise_moves_as_the_robots_actuator(tmp_path, simulator):
     ends = []
     for drive in (DriveSpec(), DriveSpec(torque_noise=1e-12)):
         sim, actuation = hinge(tmp_path, simulator, kv=0.05, substeps=5, drive=drive)
@@ -216,8 +216,8 @@ def test_relative_actions_add_up_within_the_range_and_are_smoothed(tmp_path):
     assert expected > 1.9
 
 
-def test_offsets_are_from_the_target_that_an_episode_began_with(tmp_path):
-    """Two environments start at 0.3 and −1.8 rad: a ⟼ start + 0.5 a, within ±2; the second begins again where its joint is then."""
+def test_offsets_are_relative_to_the_target_at_the_start_of_the_episode(tmp_path):
+    """Two environments start at 0.3 and −1.8 rad: a ⟼ start + 0.5 a, within ±2. The second restarts from its current angle."""
     sim, actuation = hinge(tmp_path, BatchSimulation, num_envs=2, action=ActionSpec(mode="offset", scale=0.5))
     sim.qpos[:, 0] = torch.tensor([0.3, -1.8])
     begin(actuation, torch.tensor([True, True]), torch.tensor([1, 1]))
@@ -238,8 +238,8 @@ def test_offsets_are_from_the_target_that_an_episode_began_with(tmp_path):
     assert actuation.target[:, 0].tolist() == pytest.approx([0.3, 0.7], abs=1e-6)
 
 
-def test_offsets_of_half_a_range_reach_as_far_as_it_is_wide(tmp_path):
-    """The joint's range is ±2: from −0.5 rad an action of −1 to 1 asks for −2.5 to 1.5 rad, of which −2 is the end."""
+def test_half_range_offsets_span_the_joints_range(tmp_path):
+    """The range is ±2: from −0.5 rad, actions of −1 to 1 ask for −2.5 to 1.5 rad, clipped at −2."""
     sim, actuation = hinge(tmp_path, BatchSimulation, num_envs=3, action=ActionSpec(mode="offset", scale="half_range"))
     sim.qpos[:, 0] = -0.5
     begin(actuation, torch.ones(3, dtype=torch.bool), torch.ones(3, dtype=torch.int64))
@@ -251,11 +251,11 @@ def test_offsets_of_half_a_range_reach_as_far_as_it_is_wide(tmp_path):
         ActionSpec(scale="halfrange")
 
 
-# What is drawn
+# Draws
 
 
-def test_slides_have_a_scale_of_their_own_and_none_of_what_is_an_angle():
-    """A slide of 2 kg beside a hinge: a target 1 cm away pulls with k_p · 1 cm, whatever bias, deadband and play hinges have."""
+def test_slides_have_their_own_scale_and_no_angular_imperfections():
+    """A target 1 cm away pulls the 2 kg slide with k_p · 1 cm, whatever bias, deadband and play the hinge has."""
     joints = '<body><joint name="{0}" type="{0}" axis="0 0 1" range="-1 1" limited="true"/><geom size=".1" mass="2"/></body>'
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><compiler angle="radian"/><option gravity="0 0 0"/><worldbody>'
@@ -264,11 +264,11 @@ def test_slides_have_a_scale_of_their_own_and_none_of_what_is_an_angle():
         + "".join(f'<position joint="{name}" kp="50" forcerange="-9 9"/>' for name in ("slide", "hinge"))
         + "</actuator></mujoco>"
     )
-    own = Actuators.of(model, ["slide", "hinge"])
-    assert own.is_slide.tolist() == [True, False]
+    actuators = Actuators.of(model, ["slide", "hinge"])
+    assert actuators.is_slide.tolist() == [True, False]
     arrays = {name: torch.zeros(3, 2, dtype=torch.float64) for name in ("qpos", "qvel", "ctrl", "qfrc_applied")}
     drive = DriveSpec(bias=(0.05, 0.05), deadband=(0.02, 0.02), backlash=(0.04, 0.04), top_speed=1.0)
-    actuation = Actuation(own, arrays, ActionSpec(scale=0.1, slide_scale=0.01), drive, Draws(0, 3))
+    actuation = Actuation(actuators, arrays, ActionSpec(scale=0.1, slide_scale=0.01), drive, Draws(0, 3))
     begin(actuation, torch.ones(3, dtype=torch.bool), torch.ones(3, dtype=torch.int64))
     actuation.command(torch.ones(3, 2))
     torch.testing.assert_close(actuation.target, torch.tensor([[0.01, 0.1]]).double().expand(3, 2))
@@ -284,7 +284,7 @@ def test_slides_have_a_scale_of_their_own_and_none_of_what_is_an_angle():
         Actuation(slide, arrays, ActionSpec(scale=0.1, slide_scale=0.01), drive, Draws(0, 3))
 
 
-def drawn(seed=0, num_envs=64, first_env=0, episode=1, spec=PAPER):
+def drawn_actuation(seed=0, num_envs=64, first_env=0, episode=1, spec=PAPER):
     arrays = {name: torch.zeros(num_envs, 3, dtype=torch.float64) for name in ("qpos", "qvel", "ctrl", "qfrc_applied")}
     model = mujoco.MjModel.from_xml_string(THREE)
     actuation = Actuation(
@@ -301,8 +301,8 @@ THREE = '<mujoco><compiler angle="radian"/><worldbody>{}</worldbody><actuator>{}
 )
 
 
-def test_draws_are_counted_the_same_for_64_environments_as_for_twice_32():
-    whole, halves = drawn(), [drawn(num_envs=32), drawn(num_envs=32, first_env=32)]
+def test_draws_of_64_environments_equal_those_of_twice_32():
+    whole, halves = drawn_actuation(), [drawn_actuation(num_envs=32), drawn_actuation(num_envs=32, first_env=32)]
     for name, value in whole.drawn.items():
         assert torch.equal(value, torch.cat([half.drawn[name] for half in halves])), name
     for actuation in (whole, *halves):
@@ -311,55 +311,55 @@ def test_draws_are_counted_the_same_for_64_environments_as_for_twice_32():
 
 
 def test_draws_are_uniform_in_their_ranges():
-    """Mean and variance of U(a, b) within 5 standard errors, and no joint's draws go with another's."""
-    actuation = drawn(num_envs=20_000)
+    """Mean and variance of U(a, b) lie within 5 standard errors, and joints are uncorrelated."""
+    actuation = drawn_actuation(num_envs=20_000)
     for name in ("gain", "damping", "strength", "bias", "deadband", "backlash", "kick"):
         low, high = getattr(PAPER, name)
-        found, width = actuation.drawn[name].numpy(), high - low
-        assert low <= found.min() and found.max() <= high
-        count = found.size
-        assert abs(found.mean() - (low + high) / 2) < 5 * width / np.sqrt(12 * count), name
-        assert abs(found.var() - width**2 / 12) < 5 * width**2 / np.sqrt(180 * count), name
-        assert np.abs(np.corrcoef(found.T) - np.eye(3)).max() < 5 / np.sqrt(len(found)), name
+        draws, width = actuation.drawn[name].numpy(), high - low
+        assert low <= draws.min() and draws.max() <= high
+        count = draws.size
+        assert abs(draws.mean() - (low + high) / 2) < 5 * width / np.sqrt(12 * count), name
+        assert abs(draws.var() - width**2 / 12) < 5 * width**2 / np.sqrt(180 * count), name
+        assert np.abs(np.corrcoef(draws.T) - np.eye(3)).max() < 5 / np.sqrt(len(draws)), name
     gain, kick = actuation.drawn["gain"].flatten(), actuation.drawn["kick"].flatten()
     assert abs(np.corrcoef(gain, kick)[0, 1]) < 5 / np.sqrt(len(gain))
 
 
-def test_noise_is_uniform_and_another_at_each_physics_step_episode_and_seed():
-    actuation = drawn(num_envs=20_000, spec=DriveSpec(torque_noise=0.1))
+def test_noise_is_uniform_and_differs_per_physics_step_episode_and_seed():
+    actuation = drawn_actuation(num_envs=20_000, spec=DriveSpec(torque_noise=0.1))
     torques = []
     for _ in range(3):
         actuation.drive()
         torques.append(actuation.torque.flatten().numpy().copy())
-    others = [
-        drawn(num_envs=20_000, episode=2, spec=DriveSpec(torque_noise=0.1)),
-        drawn(seed=1, num_envs=20_000, spec=DriveSpec(torque_noise=0.1)),
+    variants = [
+        drawn_actuation(num_envs=20_000, episode=2, spec=DriveSpec(torque_noise=0.1)),
+        drawn_actuation(seed=1, num_envs=20_000, spec=DriveSpec(torque_noise=0.1)),
     ]
-    for other in others:
-        other.drive()
-        torques.append(other.torque.flatten().numpy().copy())
-    for found in torques:
-        assert np.abs(found).max() <= 0.1 and abs(found.mean()) < 5 * 0.1 / np.sqrt(3 * found.size)
-        assert abs(found.var() - 0.01 / 3) < 5 * 0.01 * np.sqrt(4 / 45 / found.size)
+    for variant in variants:
+        variant.drive()
+        torques.append(variant.torque.flatten().numpy().copy())
+    for torque in torques:
+        assert np.abs(torque).max() <= 0.1 and abs(torque.mean()) < 5 * 0.1 / np.sqrt(3 * torque.size)
+        assert abs(torque.var() - 0.01 / 3) < 5 * 0.01 * np.sqrt(4 / 45 / torque.size)
     assert np.abs(np.corrcoef(torques) - np.eye(5)).max() < 5 / np.sqrt(60_000)
 
 
-def test_whole_delays_are_drawn_with_both_ends():
-    delays = drawn(num_envs=3000, spec=DriveSpec(delay=(1, 3))).drawn["delay"].flatten()
+def test_delays_are_whole_steps_and_include_both_bounds():
+    delays = drawn_actuation(num_envs=3000, spec=DriveSpec(delay=(1, 3))).drawn["delay"].flatten()
     counts = torch.bincount(delays.to(torch.int64), minlength=4)
     assert counts[0] == 0 and len(counts) == 4
     assert (counts[1:] - 3000).abs().max() < 5 * np.sqrt(9000 * 2 / 9)
 
 
-def test_only_chosen_environments_are_drawn_anew_and_placed():
-    actuation = drawn(num_envs=4)
-    before = {name: value.clone() for name, value in actuation.drawn.items()}
+def test_only_the_chosen_environments_are_redrawn_and_placed():
+    actuation = drawn_actuation(num_envs=4)
+    old_draws = {name: value.clone() for name, value in actuation.drawn.items()}
     actuation.command(torch.ones(4, 3, dtype=torch.float64))
     target = actuation.target.clone()
     begin(actuation, torch.tensor([False, True, False, True]), torch.tensor([1, 2, 1, 2]))
     for name, value in actuation.drawn.items():
-        assert torch.equal(value[[0, 2]], before[name][[0, 2]])
-        assert name == "delay" or not torch.equal(value[[1, 3]], before[name][[1, 3]])
+        assert torch.equal(value[[0, 2]], old_draws[name][[0, 2]])
+        assert name == "delay" or not torch.equal(value[[1, 3]], old_draws[name][[1, 3]])
     assert torch.equal(actuation.target[[0, 2]], target[[0, 2]]) and not actuation.target[[1, 3]].any()
 
 
@@ -375,8 +375,8 @@ def test_joints_that_cannot_be_driven_are_named(text, message):
 
 
 @BOTH
-def test_drives_that_begin_at_controls_press(tmp_path, simulator):
-    """A hand that holds something begins with targets inside it: torque k (w − q) from the first step on, also with play."""
+def test_drives_that_begin_at_controls_press_from_the_first_step(tmp_path, simulator):
+    """A hand that already grips begins with targets inside the object: torque is k (w − q) at once, also with play."""
     for drive in (None, DriveSpec(backlash=(0.02, 0.02))):
         sim, actuation = hinge(tmp_path, simulator, num_envs=2, action=ActionSpec(), drive=drive)
         sim.reset(ctrl=[0.1])

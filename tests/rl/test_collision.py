@@ -1,4 +1,4 @@
-"""`physics: {collision: primitive}` and the solver's options in a task's document, as the simulation has them."""
+"""`physics: {collision: primitive}` and the solver's options of a task's document reach the simulation."""
 
 from pathlib import Path
 
@@ -24,13 +24,13 @@ def test_colliders_and_options_reach_the_simulation(task, palm):
     assert is_mesh.any() and not model.geom_contype[is_mesh].any() and not model.geom_conaffinity[is_mesh].any()
     assert (model.opt.ls_tolerance, model.opt.iterations, model.opt.tolerance) == (0.05, 20, 1e-6)
     for _ in range(20):
-        made = env.step(torch.zeros(2, env.num_actions))
-    assert not made.info.faults.any()
+        result = env.step(torch.zeros(2, env.num_actions))
+    assert not result.info.faults.any()
     contacts = env.sim.env_model(0).geom(f"tgdsl/{palm}/collider/0").contype[0]
-    assert contacts  # the palm's core
+    assert contacts  # the core of the palm
     env.close()
 
 
-def test_a_word_that_is_none_is_told_at_its_place():
+def test_an_unknown_collision_word_is_reported_at_its_place():
     with pytest.raises(SpecError, match=r"physics\.collision"):
         load_task(TASK, {"physics.collision": "capsule"})

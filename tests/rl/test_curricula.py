@@ -1,4 +1,4 @@
-"""Weights and other numbers of terms that follow the progress of learning, in steps that are already compiled too."""
+"""Curricula: weights and parameters of terms that follow the progress of learning, also in compiled steps."""
 
 from pathlib import Path
 
@@ -41,13 +41,13 @@ def test_a_weight_is_linear_in_iterations(tmp_path):
     env = tiny_env(tmp_path, more=EFFORT)
     for iteration, weight in ((0, 0.0), (10, 0.0), (15, -0.125), (20, -0.25), (30, -0.5), (99, -0.5)):
         env.curricula.advance(iteration, None)
-        made = env.step(torch.full((4, 2), 0.7))
+        result = env.step(torch.full((4, 2), 0.7))
         expected = weight * env.control_step * effort(env)
         assert effort(env).min() > 1e-6
-        np.testing.assert_allclose(made.info.terms["effort"], expected, rtol=1e-6, atol=0)
+        np.testing.assert_allclose(result.info.terms["effort"], expected, rtol=1e-6, atol=0)
 
 
-def test_a_weight_follows_a_score_of_which_less_is_better(tmp_path):
+def test_a_weight_follows_a_score_that_should_fall(tmp_path):
     by_score = "by: score, first: 0.5, last: 0.1, start: 1, end: 3"
     env = tiny_env(tmp_path, more=EFFORT.replace("first: 10, last: 30, start: 0, end: -0.5", by_score))
     for score, weight in ((None, 1.0), (0.5, 1.0), (0.2, 1 + 2 * 0.3 / 0.4), (0.1, 3.0), (0.0, 3.0)):
@@ -55,25 +55,25 @@ def test_a_weight_follows_a_score_of_which_less_is_better(tmp_path):
         assert env.curricula.values["rewards.effort"].item() == pytest.approx(weight)
 
 
-def test_a_parameter_of_a_term_follows_too(tmp_path):
+def test_a_parameter_of_a_term_can_follow_a_curriculum(tmp_path):
     env = tiny_env(tmp_path, more=NEAR)
     for iteration, width in ((0, 0.05), (2, 0.03), (4, 0.01)):
         env.curricula.advance(iteration, None)
-        made = env.step(torch.full((4, 2), 0.3))
+        result = env.step(torch.full((4, 2), 0.3))
         rate = np.exp(-np.maximum(env.now.distance.numpy(), 0.0) / width).mean(axis=1)
-        np.testing.assert_allclose(made.info.terms["close"], 2 * env.control_step * rate, rtol=1e-6)
+        np.testing.assert_allclose(result.info.terms["close"], 2 * env.control_step * rate, rtol=1e-6)
 
 
 def document(folder, name):
-    """Return the document of a task: of a small hand, or else the example's."""
+    """Return the document of a task: of a small hand where there is one, else the example's."""
     if name == "screwdriver":
         return write_pincer(folder)
     return EXAMPLES / f"{name}.yaml" if name in ("grip_force", "hot_ball") else write_task(folder, name)
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_each_number_of_a_task_that_follows_has_the_effect_that_it_has_in_the_document(tmp_path, name):
-    """To the bit, all at once: rewards, observations and ends with nine tenths of each number."""
+def test_a_curriculums_number_acts_as_if_set_in_the_document(tmp_path, name):
+    """All numbers at nine tenths, at once: rewards, observations and terminations are equal to the bit."""
     file = document(tmp_path, name)
     loaded = load_task(file, QUIET)
     numbers = {
@@ -94,8 +94,8 @@ def test_each_number_of_a_task_that_follows_has_the_effect_that_it_has_in_the_do
             assert all(torch.equal(value, theirs[key]) for key, value in mine.items())
 
 
-def test_stages_of_a_number_in_one_document(tmp_path):
-    """What progress pays while the object coasts falls from 1 to 0, as runs with another `--set` each had it."""
+def test_one_document_can_have_stages_of_a_number(tmp_path):
+    """The pay for progress while the object coasts falls from 1 to 0, without separate runs with `--set`."""
     more = "terms: {stage: {term: linear, of: hold.coasting_pay, first: 10, last: 20, start: 1, end: 0}}\n"
     env, pays = tiny_env(tmp_path, more=more), []
     for iteration in (0, 15, 20):
@@ -108,7 +108,7 @@ def test_stages_of_a_number_in_one_document(tmp_path):
 
 
 def test_a_compiled_step_reads_the_number_of_each_iteration(tmp_path):
-    """Without a break of its graph, and without one that is compiled again."""
+    """Without a graph break and without recompiling."""
     env = tiny_env(tmp_path, more=EFFORT)
     env.step(torch.full((4, 2), 0.7))
     graphs = []
@@ -117,22 +117,22 @@ def test_a_compiled_step_reads_the_number_of_each_iteration(tmp_path):
         graphs.append(graph)
         return graph
 
-    fused = torch.compile(env.task.reward, fullgraph=True, backend=backend)
+    compiled = torch.compile(env.task.reward, fullgraph=True, backend=backend)
     for iteration, weight in ((0, 0.0), (15, -0.125), (30, -0.5)):
         env.curricula.advance(iteration, None)
-        terms = fused(env.now, torch.zeros(4, dtype=torch.bool))
+        terms = compiled(env.now, torch.zeros(4, dtype=torch.bool))
         np.testing.assert_allclose(terms["effort"], weight * effort(env), rtol=1e-9)
     assert len(graphs) == 1
 
 
-def test_a_curriculum_of_ones_own_and_its_state(tmp_path):
+def test_a_user_defined_curriculum_saves_its_state(tmp_path):
     (tmp_path / "own.py").write_text(OWN)
     more = 'terms: {fade: {term: "own.py:Halves", of: rewards.near, begin: 4}}\n'
-    env, again = tiny_env(tmp_path, more=more), tiny_env(tmp_path, more=more)
+    env, resumed = tiny_env(tmp_path, more=more), tiny_env(tmp_path, more=more)
     env.curricula.advance(3, None)
-    again.load_state_dict(env.state_dict())
-    assert again.curricula.values["rewards.near"].item() == 0.5
-    one, two = env.step(torch.zeros(4, 2)), again.step(torch.zeros(4, 2))
+    resumed.load_state_dict(env.state_dict())
+    assert resumed.curricula.values["rewards.near"].item() == 0.5
+    one, two = env.step(torch.zeros(4, 2)), resumed.step(torch.zeros(4, 2))
     assert torch.equal(one.info.terms["near"], two.info.terms["near"])
 
 
@@ -152,7 +152,7 @@ def test_a_curriculum_of_ones_own_and_its_state(tmp_path):
         (("last: 30", "last: 5"), "terms.more", "last, iteration 5, is before first, 10"),
     ],
 )
-def test_what_is_wrong_with_a_curriculum_is_told_at_its_place(tmp_path, change, path, says):
+def test_errors_in_a_curriculum_are_reported_at_their_place(tmp_path, change, path, says):
     with pytest.raises(SpecError) as caught:
         load_task(write_task(tmp_path, more=EFFORT.replace(*change)))
     problem = caught.value.problems[0]

@@ -1,4 +1,4 @@
-"""Counted random numbers: uniform, normal and whole, independent of each other, of the batch and of the order of asking."""
+"""Counted random numbers: uniform, normal and whole; independent of each other, of the batch and of the order of calls."""
 
 import numpy as np
 import pytest
@@ -15,28 +15,28 @@ def ones(num: int) -> torch.Tensor:
 
 
 def test_uniform_and_normal_numbers_have_their_moments():
-    """Mean, variance and fourth moment within 5 standard errors."""
+    """Mean, variance and fourth moment lie within 5 standard errors."""
     draws = Draws(0, COUNT)
-    flat = draws.uniform("a", ones(COUNT), 2, -1.0, 3.0).numpy()
-    assert flat.min() >= -1 and flat.max() <= 3
-    assert abs(flat.mean() - 1) < 5 * 4 / np.sqrt(12 * flat.size)
-    assert abs(flat.var() - 16 / 12) < 5 * 16 / np.sqrt(180 * flat.size)
-    bell = draws.normal("b", ones(COUNT), 3).numpy()
-    assert bell.shape == (COUNT, 3)
-    assert abs(bell.mean()) < 5 / np.sqrt(bell.size) and abs(bell.var() - 1) < 5 * np.sqrt(2 / bell.size)
-    assert abs((bell**4).mean() - 3) < 5 * np.sqrt(96 / bell.size)
-    assert np.abs(np.corrcoef(np.concatenate([flat, bell], axis=1).T) - np.eye(5)).max() < 5 / np.sqrt(COUNT)
+    uniform = draws.uniform("a", ones(COUNT), 2, -1.0, 3.0).numpy()
+    assert uniform.min() >= -1 and uniform.max() <= 3
+    assert abs(uniform.mean() - 1) < 5 * 4 / np.sqrt(12 * uniform.size)
+    assert abs(uniform.var() - 16 / 12) < 5 * 16 / np.sqrt(180 * uniform.size)
+    normal = draws.normal("b", ones(COUNT), 3).numpy()
+    assert normal.shape == (COUNT, 3)
+    assert abs(normal.mean()) < 5 / np.sqrt(normal.size) and abs(normal.var() - 1) < 5 * np.sqrt(2 / normal.size)
+    assert abs((normal**4).mean() - 3) < 5 * np.sqrt(96 / normal.size)
+    assert np.abs(np.corrcoef(np.concatenate([uniform, normal], axis=1).T) - np.eye(5)).max() < 5 / np.sqrt(COUNT)
 
 
-def test_whole_numbers_have_both_ends_and_equal_shares():
-    found = Draws(0, COUNT).integers("c", ones(COUNT), 1, -2, 2).flatten()
-    counts = torch.bincount(found + 2, minlength=5)
+def test_whole_numbers_include_both_bounds_equally_often():
+    numbers = Draws(0, COUNT).integers("c", ones(COUNT), 1, -2, 2).flatten()
+    counts = torch.bincount(numbers + 2, minlength=5)
     assert len(counts) == 5
     assert (counts - COUNT / 5).abs().max() < 5 * np.sqrt(COUNT * 0.2 * 0.8)
 
 
 @pytest.mark.parametrize("other", ["what", "count", "high count", "env", "seed"])
-def test_another_purpose_count_environment_or_seed_has_other_numbers(other):
+def test_numbers_differ_by_purpose_count_environment_and_seed(other):
     num = 10_000
     first = Draws(0, num).uniform("a", ones(num), 1).numpy().ravel()
     second = {
@@ -49,7 +49,7 @@ def test_another_purpose_count_environment_or_seed_has_other_numbers(other):
     assert abs(np.corrcoef(first, second.numpy().ravel())[0, 1]) < 5 / np.sqrt(num)
 
 
-def test_numbers_do_not_hang_on_batch_order_or_on_how_many_are_asked_for():
+def test_numbers_do_not_depend_on_batch_order_or_amount():
     whole = Draws(3, 8)
     numbers = whole.uniform("x", torch.arange(8), 4)
     halves = [Draws(3, 4, first_env=first).uniform("x", torch.arange(first, first + 4), 4) for first in (0, 4)]
@@ -59,8 +59,8 @@ def test_numbers_do_not_hang_on_batch_order_or_on_how_many_are_asked_for():
     assert torch.equal(late.uniform("x", torch.arange(8), 2), numbers[:, :2])
 
 
-def hashed(seed: int, what: str, env: int, count: int, index: int) -> float:
-    """Return a number between 0 and 1 by the definition, in whole numbers of any size."""
+def hashed_number(seed: int, what: str, env: int, count: int, index: int) -> float:
+    """Return the number in (0, 1) that the definition gives, in Python's integers."""
     mask = 2**32 - 1
 
     def mix(word: int) -> int:
@@ -76,32 +76,34 @@ def hashed(seed: int, what: str, env: int, count: int, index: int) -> float:
     return ((word >> (32 - UNIFORM_BITS)) + 0.5) / 2**UNIFORM_BITS
 
 
-def test_numbers_for_several_purposes_are_those_for_each():
-    """By the definition in plain Python, for counts beyond 32 bits too, before and after another seed."""
+def test_numbers_for_several_purposes_equal_separate_calls():
+    """Against the definition in plain Python, with counts beyond 32 bits, before and after reseeding."""
     draws, counts = Draws(3, 5, first_env=7), torch.tensor([0, 1, (5 << 32) + 2, 2**40, 9])
     for seed in (3, 4):
         draws.reseed(seed)
-        found = draws.shares({"a": 3, "b": 1, "c": 2}, counts)
-        for what, share in found.items():
-            wanted = [[hashed(seed, what, 7 + e, int(counts[e]), i) for i in range(share.shape[1])] for e in range(5)]
-            np.testing.assert_array_equal(share.numpy(), np.float32(wanted))
-            assert torch.equal(draws.uniform(what, counts, share.shape[1], -1.0, 2.0), within(share, -1.0, 2.0))
+        shares = draws.shares({"a": 3, "b": 1, "c": 2}, counts)
+        for purpose, share in shares.items():
+            expected = [
+                [hashed_number(seed, purpose, 7 + e, int(counts[e]), i) for i in range(share.shape[1])] for e in range(5)
+            ]
+            np.testing.assert_array_equal(share.numpy(), np.float32(expected))
+            assert torch.equal(draws.uniform(purpose, counts, share.shape[1], -1.0, 2.0), within(share, -1.0, 2.0))
 
 
-def test_words_are_mixed_alike_by_torch_and_by_numpy():
-    """Of all shapes, those without an element included, and of tensors that are not contiguous."""
+def test_torch_and_numpy_mix_words_identically():
+    """For all shapes, including empty and non-contiguous tensors."""
     generator = torch.Generator().manual_seed(0)
     word = torch.randint(-(2**31), 2**31, (40, 30, 2), generator=generator).to(torch.int32)
-    for own in (word, word[:, 3:7].transpose(0, 1), word[..., 1], word[:0]):
-        found = mix_on_host(own.numpy().view(np.uint32))
-        assert found.dtype == np.uint32
-        np.testing.assert_array_equal(found.view(np.int32), mix(own).numpy())
+    for words in (word, word[:, 3:7].transpose(0, 1), word[..., 1], word[:0]):
+        mixed = mix_on_host(words.numpy().view(np.uint32))
+        assert mixed.dtype == np.uint32
+        np.testing.assert_array_equal(mixed.view(np.int32), mix(words).numpy())
     assert word.min() < 0 < word.max()
 
 
 @pytest.mark.parametrize("is_compiled", [False, True])
-def test_numbers_made_ahead_are_those_asked_for_one_by_one(is_compiled):
-    """While counters go on by one, after some environments begin again, counters go back or stay, and with another seed."""
+def test_numbers_drawn_ahead_equal_separate_calls(is_compiled):
+    """While counters advance, restart, go back or stay, and after reseeding."""
     draws, plain, counts = Draws(2, 4), Draws(2, 4), torch.arange(4) + (3 << 32)
     draws._is_on_host = not is_compiled
     for call in range(24):
@@ -111,7 +113,7 @@ def test_numbers_made_ahead_are_those_asked_for_one_by_one(is_compiled):
             counts -= 2
         if call == 17:
             draws.reseed(5), plain.reseed(5)
-        found = draws.shares_ahead("noise", counts, 3, ahead=5)
-        assert torch.equal(found, plain.shares({"noise": 3}, counts)["noise"]), call
+        shares = draws.shares_ahead("noise", counts, 3, ahead=5)
+        assert torch.equal(shares, plain.shares({"noise": 3}, counts)["noise"]), call
         counts += call != 11
     assert torch.equal(draws.shares_ahead("other", counts, 2, ahead=5), plain.shares({"other": 2}, counts)["other"])

@@ -1,4 +1,4 @@
-"""A whole step: order, instants, episodes, random numbers, what is told of them."""
+"""Control steps of TouchEnv: order of operations, episodes, random numbers, messages."""
 
 import dataclasses
 import math
@@ -25,114 +25,114 @@ def make(tmp_path):
     yield from tiny_envs(tmp_path)
 
 
-def test_groups_have_the_papers_contents(make):
+def test_groups_match_the_paper(make):
     env = make()
-    touched = 6 * 4
+    num_features = 6 * 4
     assert env.groups == {
         "proprio": 3 * 2,
-        "tactile_sensors": touched,
+        "tactile_sensors": num_features,
         "priv_proprio": 3 * 2 + 2 * 3,
         "goal": 7,
         "priv_obj_state": 3 + 6 + 3 + 3,
         "priv_obj_props": 2 + 4,
     }
     obs = env.reset()
-    now_pos, now_vel = env.sim.qpos, env.sim.qvel
-    torch.testing.assert_close(obs["proprio"][:, :2], now_pos[:, :2].float())
-    torch.testing.assert_close(obs["proprio"][:, 2:4], now_vel[:, :2].float())
+    qpos, qvel = env.sim.qpos, env.sim.qvel
+    torch.testing.assert_close(obs["proprio"][:, :2], qpos[:, :2].float())
+    torch.testing.assert_close(obs["proprio"][:, 2:4], qvel[:, :2].float())
     assert not obs["proprio"][:, 4:].any()
     ball = obs["priv_obj_state"]
-    torch.testing.assert_close(ball[:, :3], now_pos[:, 3:6].float())
+    torch.testing.assert_close(ball[:, :3], qpos[:, 3:6].float())
     assert ball[:, 3:9].tolist() == [[1, 0, 0, 0, 1, 0]] * 4 and not ball[:, 9:].any()
     torch.testing.assert_close(obs["priv_obj_props"][:, :2], torch.tensor([[0.8, 0.1]] * 4))
     for column, (body, x) in enumerate((("left", 0.005), ("left", 0.005), ("right", -0.005), ("right", -0.005))):
-        lift = 0.01 if column % 2 else 0.0
-        point = taxel_world(env, body, (x, lift, lift), env.sim.qpos[0].numpy())
+        offset = 0.01 if column % 2 else 0.0
+        point = taxel_world(env, body, (x, offset, offset), env.sim.qpos[0].numpy())
         expected = float((point - env.sim.qpos[0, 3:6]).norm()) - RADIUS
         assert obs["priv_obj_props"][0, 2 + column].item() == pytest.approx(expected, abs=1e-6)
     action = actions(env, 1)[0]
-    made = env.step(action)
-    torch.testing.assert_close(made.obs["proprio"][:, 4:], action)
-    assert torch.equal(made.obs["priv_proprio"][:, :6], made.obs["proprio"])
+    result = env.step(action)
+    torch.testing.assert_close(result.obs["proprio"][:, 4:], action)
+    assert torch.equal(result.obs["priv_proprio"][:, :6], result.obs["proprio"])
 
 
 @pytest.mark.parametrize("simulator", ["mujoco", pytest.param("warp", marks=pytest.mark.slow)])
-def test_every_group_is_of_the_instant_of_its_call(make, simulator):
-    """A ball that moves as a known function of time, put elsewhere by each reset: of now, not of the step before."""
+def test_every_group_describes_the_current_instant(make, simulator):
+    """The ball moves as a known function of time, and each reset moves it: readings are never one step late."""
     env = make(3, task="tiny_tasks:Coasting", gravity="0 0 0", more="episode: 0.1 s\ndrop_distance: 1\n", simulator=simulator)
     assert env.max_steps == 4 and env.control_step == 0.025
     env.reset()
-    env.steps[1] = 2  # the others' episodes end two steps later
+    env.steps[1] = 2  # the other episodes end two steps later
     age, episode = torch.zeros(3), torch.tensor([2.0, 2.0, 2.0])
     speed = env.task.speed().cpu().float()
     for action in actions(env, 11):
-        made = env.step(action)
+        result = env.step(action)
         age += 1
-        where = made.info.final_obs["priv_obj_state"].cpu()
-        # State is handed out of the start of the last physics step.
-        passed = 0.025 * age - 0.005
-        torch.testing.assert_close(where[:, 2], RADIUS + 0.2 + 0.1 * episode, rtol=0, atol=1e-6)
-        torch.testing.assert_close(where[:, 1], speed * passed, rtol=0, atol=1e-6)
-        torch.testing.assert_close(where[:, 10], speed, rtol=0, atol=1e-6)
-        ended = made.truncated.cpu()
-        episode, age = episode + ended, torch.where(ended, 0.0, age)
-        ball = made.obs["priv_obj_state"].cpu()
-        passed = torch.where(ended, 0.0, passed)
-        torch.testing.assert_close(ball[:, 1], speed * passed, rtol=0, atol=1e-6)
+        final_state = result.info.final_obs["priv_obj_state"].cpu()
+        # The state is that at the start of the last physics step.
+        time = 0.025 * age - 0.005
+        torch.testing.assert_close(final_state[:, 2], RADIUS + 0.2 + 0.1 * episode, rtol=0, atol=1e-6)
+        torch.testing.assert_close(final_state[:, 1], speed * time, rtol=0, atol=1e-6)
+        torch.testing.assert_close(final_state[:, 10], speed, rtol=0, atol=1e-6)
+        truncated = result.truncated.cpu()
+        episode, age = episode + truncated, torch.where(truncated, 0.0, age)
+        ball = result.obs["priv_obj_state"].cpu()
+        time = torch.where(truncated, 0.0, time)
+        torch.testing.assert_close(ball[:, 1], speed * time, rtol=0, atol=1e-6)
         torch.testing.assert_close(ball[:, 2], RADIUS + 0.2 + 0.1 * episode, rtol=0, atol=1e-6)
         torch.testing.assert_close(env.now.object.pos.cpu().float(), ball[:, :3])
         for env_id in range(3):
             qpos = env.sim.model.qpos0.copy()
-            qpos[:2] = made.obs["proprio"][env_id, :2].double().cpu()
+            qpos[:2] = result.obs["proprio"][env_id, :2].double().cpu()
             point = taxel_world(env, "left", (0.005, 0.0, 0.0), qpos)
             expected = (point.float() - ball[env_id, :3]).norm() - RADIUS
-            assert made.obs["priv_obj_props"][env_id, 2].item() == pytest.approx(float(expected), abs=2e-6)
-        assert not made.terminated.any()
+            assert result.obs["priv_obj_props"][env_id, 2].item() == pytest.approx(float(expected), abs=2e-6)
+        assert not result.terminated.any()
     assert episode.tolist() == [4, 5, 4]
 
 
-def test_episodes_of_known_length_are_truncated(make):
+def test_episodes_are_truncated_at_their_length(make):
     env = make(3, more="episode: 0.1 s\n")
     env.reset()
     env.steps[2] = 3
-    lengths = []
+    truncations = []
     for action in actions(env, 8):
-        made = env.step(action)
-        assert torch.equal(made.info.ended, made.truncated | made.terminated)
-        lengths.append(made.truncated.tolist())
-        assert torch.equal(made.info.episode_steps == 4, made.truncated)
-    assert [row[0] for row in lengths] == [False, False, False, True] * 2
-    assert [row[2] for row in lengths] == [True, False, False, False] * 2
+        result = env.step(action)
+        assert torch.equal(result.info.ended, result.truncated | result.terminated)
+        truncations.append(result.truncated.tolist())
+        assert torch.equal(result.info.episode_steps == 4, result.truncated)
+    assert [row[0] for row in truncations] == [False, False, False, True] * 2
+    assert [row[2] for row in truncations] == [True, False, False, False] * 2
 
 
-def test_what_is_lost_terminates_and_is_not_truncated(make):
+def test_a_lost_object_terminates_without_truncation(make):
     env = make(3)
     env.reset()
     env.steps[:] = torch.tensor([0, env.max_steps - 1, env.max_steps - 1])
     env.sim.qpos[:2, 4] += 0.3
-    made = env.step(torch.zeros(3, 2))
-    assert made.terminated.tolist() == [True, True, False]
-    assert made.truncated.tolist() == [False, False, True]
-    assert (made.info.terms["drop"] < 0).tolist() == [True, True, False]
+    result = env.step(torch.zeros(3, 2))
+    assert result.terminated.tolist() == [True, True, False]
+    assert result.truncated.tolist() == [False, False, True]
+    assert (result.info.terms["drop"] < 0).tolist() == [True, True, False]
     assert env.steps.tolist() == [0, 0, 0]
 
 
-def test_terms_sum_to_the_reward_and_to_the_episode(make):
+def test_terms_sum_to_the_reward_and_to_the_return(make):
     env = make(3, more="episode: 0.1 s\n" + RANDOM)
     env.reset()
     total = torch.zeros(3)
     for i, action in enumerate(actions(env, 4)):
-        made = env.step(action)
-        torch.testing.assert_close(sum(made.info.terms.values()), made.reward)
-        total += made.reward
-        assert made.info.episode_steps.tolist() == [i + 1] * 3
-    torch.testing.assert_close(made.info.episode_return, total)
-    torch.testing.assert_close(sum(made.info.episode_terms.values()), total)
-    following = env.step(actions(env, 1)[0])
-    torch.testing.assert_close(following.info.episode_return, following.reward)
+        result = env.step(action)
+        torch.testing.assert_close(sum(result.info.terms.values()), result.reward)
+        total += result.reward
+        assert result.info.episode_steps.tolist() == [i + 1] * 3
+    torch.testing.assert_close(result.info.episode_return, total)
+    torch.testing.assert_close(sum(result.info.episode_terms.values()), total)
+    after = env.step(actions(env, 1)[0])
+    torch.testing.assert_close(after.info.episode_return, after.reward)
 
 
-def test_the_last_observations_are_handed_out(make):
+def test_final_obs_holds_the_last_observations(make):
     env = make(3, more="episode: 0.1 s\n")
     other = make(3)
     env.reset(), other.reset()
@@ -145,21 +145,21 @@ def test_the_last_observations_are_handed_out(make):
 
 
 @pytest.mark.parametrize("more", [RANDOM, NOISY, NOISY + RANDOM])
-def test_an_environments_reset_moves_nobody_else(make, more):
-    """Neither noise and history nor what is drawn: the others are as they were to the last bit."""
+def test_resetting_one_environment_leaves_the_others_unchanged(make, more):
+    """Noise, history and draws of the other environments stay identical to the bit."""
     one, other = make(more=more), make(more=more)
     assert same(one.reset(3), other.reset(3))
     others = [0, 2, 3]
     for i, action in enumerate(actions(one, STEPS)):
         if i in (2, 3, 7):
             other.steps[1] = other.max_steps - 1
-        made, found = one.step(action), other.step(action)
-        assert found.truncated.tolist() == [False, i in (2, 3, 7), False, False]
-        assert same(made.obs, found.obs, others) and torch.equal(made.reward[others], found.reward[others])
+        made, other_result = one.step(action), other.step(action)
+        assert other_result.truncated.tolist() == [False, i in (2, 3, 7), False, False]
+        assert same(made.obs, other_result.obs, others) and torch.equal(made.reward[others], other_result.reward[others])
 
 
 def test_noise_advances_once_per_control_step(make):
-    """And once more for the first reading of an episode, of those environments alone."""
+    """An episode's first reading advances it once more, in that environment only."""
     env = make(more=NOISY)
     env.reset(1)
     clock = env.touch.memory.clock
@@ -182,25 +182,25 @@ def test_the_same_seed_gives_the_same_bytes(make):
     torch.set_num_threads(1)
     assert all(same(a, b) for a, b in zip(envs[0].found, envs[1].found, strict=True))
     assert not same(envs[2]._obs, envs[0].found[0])
-    again = [envs[2].reset(4), *(envs[2].step(action).obs for action in actions(envs[2], STEPS))]
-    assert all(same(a, b) for a, b in zip(envs[0].found, again, strict=True))
+    repeated = [envs[2].reset(4), *(envs[2].step(action).obs for action in actions(envs[2], STEPS))]
+    assert all(same(a, b) for a, b in zip(envs[0].found, repeated, strict=True))
 
 
 @pytest.mark.slow
 def test_compiled_equals_eager(make):
-    """Drives with a delay, noise, pushes, resets: all that is compiled besides the module."""
+    """With delayed drives, noise, pushes and resets: everything that is compiled besides the module."""
     more = NOISY + RANDOM + "episode: 0.2 s\n"
     eager, compiled = make(more=more, seed=1), make(more=more, seed=1, compiled=True)
     for i, action in enumerate(actions(eager, STEPS)):
         for env in (eager, compiled):
             env.steps[i % 4] += 1
-        found, expected = compiled.step(action), eager.step(action)
-        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+        actual, expected = compiled.step(action), eager.step(action)
+        torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(compiled.actuation.memory(), eager.actuation.memory(), rtol=1e-6, atol=1e-9)
 
 
-def test_as_many_environments_in_two_processes(make):
-    """Random numbers are counted by the environments of all processes."""
+def test_two_processes_give_the_same_environments_as_one(make):
+    """Random numbers are counted across the environments of all processes."""
     more = NOISY + RANDOM
     whole = make(6, more=more, seed=2)
     halves = [make(3, more=more, seed=2, first_env=first) for first in (0, 3)]
@@ -214,25 +214,25 @@ def test_as_many_environments_in_two_processes(make):
             torch.testing.assert_close(torch.cat([part[name] for part in parts]), value, rtol=1e-5, atol=1e-6)
 
 
-def test_measured_velocities_are_those_of_a_hands_driver(make):
-    """Of positions at each control step, at rest at the start of each episode; privileged ones stay exact."""
+def test_measured_velocities_match_a_hands_driver(make):
+    """They follow from positions at control steps and start at rest in each episode; privileged velocities stay exact."""
     env = make(more=RANDOM + "episode: 0.2 s\njoint_vel: measured\n")
     filters, times = [VelocityFilter(0.02) for _ in range(4)], np.zeros(4)
     obs = env.reset(seed=3)
     for action in [None, *actions(env, 2 * STEPS - 3)]:
         if action is not None:
-            made = env.step(action)
-            obs, times = made.obs, times + env.control_step
-            for i in np.flatnonzero(made.info.ended):
+            result = env.step(action)
+            obs, times = result.obs, times + env.control_step
+            for i in np.flatnonzero(result.info.ended):
                 filters[i].reset()
-        for i, (own, time) in enumerate(zip(filters, times, strict=True)):
-            expected = own.update(float(time), obs["proprio"][i, :2].double().numpy())
+        for i, (velocity_filter, time) in enumerate(zip(filters, times, strict=True)):
+            expected = velocity_filter.update(float(time), obs["proprio"][i, :2].double().numpy())
             np.testing.assert_allclose(obs["proprio"][i, 2:4], expected, rtol=1e-5, atol=1e-6)
     exact = env.now.joint_vel.float()
     assert torch.equal(obs["priv_proprio"][:, 2:4], exact) and (exact - obs["proprio"][:, 2:4]).abs().max() > 0.01
 
 
-def test_what_is_drawn_is_what_physics_has(make):
+def test_the_simulation_has_the_drawn_properties(make):
     env = make(8, more=RANDOM)
     env.reset(0)
     props = env.reset()["priv_obj_props"]
@@ -258,8 +258,8 @@ def test_held_joints_stay_and_actions_move_targets(make):
     torch.testing.assert_close(env.sim.ctrl[:, :2], expected, rtol=0, atol=1e-12)
 
 
-def test_now_says_when_its_readings_are_of(make):
-    """One physics step before the end of the control step, and at 0 in an episode that has just begun."""
+def test_now_has_the_time_of_its_readings(make):
+    """One physics step before the end of the control step; 0 when an episode has just begun."""
     env = make(2)
     physics = float(env.sim.model.opt.timestep)
     assert env.now.time.tolist() == [0.0, 0.0]
@@ -270,27 +270,27 @@ def test_now_says_when_its_readings_are_of(make):
     assert env.now.time.tolist() == pytest.approx([2 * env.control_step - physics, 0.0])
 
 
-def test_actions_in_another_unit_are_warned_of_in_the_first_step(make):
+def test_large_actions_warn_in_the_first_step_only(make):
     env = make(3)
-    given = torch.tensor([[0.0, 3.0], [0.5, -50.0], [0.0, 0.0]])
+    large_actions = torch.tensor([[0.0, 3.0], [0.5, -50.0], [0.0, 0.0]])
     with pytest.warns(UserWarning, match=r"^action of right is -50 in environment 1, and clipped to \[-1, 1\]") as caught:
-        env.step(given)
+        env.step(large_actions)
     assert caught[0].filename == __file__
-    env.step(given)  # warnings are errors
-    make(3).step(torch.full((3, 2), 3.0))  # as a policy's that explores
+    env.step(large_actions)  # warnings are errors
+    make(3).step(torch.full((3, 2), 3.0))  # a policy that explores may exceed the range
 
 
 def test_a_step_prints_names_dtypes_and_shapes(make):
     env = make(3)
-    made = env.step(torch.zeros(3, 2))
-    lines = str(made.info).splitlines()
+    result = env.step(torch.zeros(3, 2))
+    lines = str(result.info).splitlines()
     assert [line.split()[0] for line in lines[:3]] == ["StepInfo", "ended", "final_obs"]
     assert lines[1].split(maxsplit=1)[1] == "bool (3,)"
     assert (
         f"proprio float32 (3, {env.groups['proprio']}), tactile_sensors float32 (3, {env.groups['tactile_sensors']})"
         in lines[2]
     )
-    assert [line.split(maxsplit=1)[1] for line in str(made).splitlines()[-4:]] == [
+    assert [line.split(maxsplit=1)[1] for line in str(result).splitlines()[-4:]] == [
         "float32 (3,)",
         *["bool (3,)"] * 2,
         "StepInfo",
@@ -298,29 +298,29 @@ def test_a_step_prints_names_dtypes_and_shapes(make):
 
 
 @pytest.mark.parametrize("more", ["", RANDOM])
-def test_an_action_that_is_no_number_ends_one_episode(make, more):
+def test_a_nan_action_ends_only_its_episode(make, more):
     env, other = make(more=more), make(more=more)
     env.reset(1), other.reset(1)
     for i, action in enumerate(actions(env, 6)):
-        given = action.clone()
+        faulty_action = action.clone()
         if i == 3:
-            given[2, 0] = math.nan
+            faulty_action[2, 0] = math.nan
             with pytest.warns(UserWarning, match="environments had faults: 1 had controls that are not finite"):
-                made = env.step(given)
+                result = env.step(faulty_action)
         else:
-            made = env.step(given)
-        found = other.step(action)
-        assert made.info.faults.tolist() == [False, False, i == 3, False] == made.terminated.tolist()
-        assert same(made.obs, found.obs, [0, 1, 3])
-        assert all(value.isfinite().all() for value in (*made.obs.values(), *made.info.final_obs.values(), made.reward))
+            result = env.step(faulty_action)
+        other_result = other.step(action)
+        assert result.info.faults.tolist() == [False, False, i == 3, False] == result.terminated.tolist()
+        assert same(result.obs, other_result.obs, [0, 1, 3])
+        assert all(value.isfinite().all() for value in (*result.obs.values(), *result.info.final_obs.values(), result.reward))
         if i == 3:
-            assert made.reward[2] == 0.0 and env.steps[2] == 0
+            assert result.reward[2] == 0.0 and env.steps[2] == 0
     assert env.sim.fault_counts.tolist() == [0, 0, 1, 0]
 
 
 @pytest.mark.parametrize("simulator", ["mujoco", pytest.param("warp", marks=pytest.mark.slow)])
-def test_an_environment_that_diverges_begins_anew(make, simulator, monkeypatch):
-    """Its score is that of the step before, as the instant at which it diverged is none."""
+def test_a_diverged_environment_is_reset(make, simulator, monkeypatch):
+    """Its score is from the step before: the diverged state has no valid score."""
     env = make(3, simulator=simulator)
     env.reset(1)
     count, advance = env.task.keep("count"), env.task.advance
@@ -329,13 +329,13 @@ def test_an_environment_that_diverges_begins_anew(make, simulator, monkeypatch):
     env.step(torch.zeros(3, 2))
     env.sim.qvel[1, 5] = 1e12
     with pytest.warns(UserWarning, match="environments had faults: 1 diverged"):
-        made = env.step(torch.zeros(3, 2))
-    assert made.info.score.tolist() == [2.0, 1.0, 2.0]
-    assert made.info.faults.tolist() == [False, True, False] == made.terminated.tolist()
-    assert made.reward[1] == 0.0 and all(value.isfinite().all() for value in made.obs.values())
+        result = env.step(torch.zeros(3, 2))
+    assert result.info.score.tolist() == [2.0, 1.0, 2.0]
+    assert result.info.faults.tolist() == [False, True, False] == result.terminated.tolist()
+    assert result.reward[1] == 0.0 and all(value.isfinite().all() for value in result.obs.values())
     for _ in range(3):
-        made = env.step(torch.zeros(3, 2))
-        assert not made.info.faults.any() and all(value.isfinite().all() for value in made.obs.values())
+        result = env.step(torch.zeros(3, 2))
+        assert not result.info.faults.any() and all(value.isfinite().all() for value in result.obs.values())
 
 
 @pytest.mark.parametrize(
@@ -346,7 +346,7 @@ def test_an_environment_that_diverges_begins_anew(make, simulator, monkeypatch):
         *(("elastomer", "elastomer", 12), ("proximity", "proximity", 24), ("force_taxel", "force_taxel", 12)),
     ],
 )
-def test_only_what_is_chosen_is_computed(make, touch, kind, size):
+def test_only_the_chosen_sensors_are_computed(make, touch, kind, size):
     env = make(2, more=f"touch: {touch}\n")
     kinds = {sensor.kind for sensor in env.touch.plan.sensors}
     assert kinds == {"link_contact", "surface_distance", *([kind] if kind else [])}
@@ -354,7 +354,7 @@ def test_only_what_is_chosen_is_computed(make, touch, kind, size):
     env.step(torch.zeros(2, 2))
 
 
-def test_a_placement_is_a_group_of_links(make):
+def test_a_placement_selects_a_group_of_links(make):
     env = make(2, more="touch: depth\nplacement: tips\n")
     assert env.groups["tactile_sensors"] == 2 and set(env.touch.taxels["depth"]["link"]) == {"right"}
 
@@ -368,33 +368,33 @@ def test_a_placement_is_a_group_of_links(make):
         ("touch: depth\nsensors: {depth: {feels: [cub]}}\n", r"task\.yaml:\d+:\d+: sensors\.depth\.feels"),
     ],
 )
-def test_what_a_task_sets_wrongly_in_its_sensors_is_named_at_its_own_key(make, more, said):
+def test_errors_in_a_tasks_sensor_settings_are_reported_at_its_key(make, more, said):
     with pytest.raises(SpecError) as error:
         make(2, more=more)
     assert [re.search(said, str(problem)) is not None for problem in error.value.problems] == [True], str(error.value)
 
 
-def test_a_placement_that_is_overridden_is_named_as_such(tmp_path):
+def test_an_error_in_an_override_names_the_override(tmp_path):
     task = write_task(tmp_path, more="touch: depth\n")
-    for options, said in (
+    for options, message in (
         ({"overrides": {"placement": "tipps"}}, '--set placement=tipps: placement: no link matches "tipps"'),
         ({"feels": [Felt("depth", "tipps", "clean")]}, 'placement: no link matches "tipps"'),
     ):
         with pytest.raises(SpecError) as error:
             TouchEnv(task, 2, threads=1, **options)
-        assert str(error.value).startswith(said)
+        assert str(error.value).startswith(message)
 
 
-def test_an_action_of_another_shape_is_refused(make):
+def test_an_action_of_the_wrong_shape_is_refused(make):
     env = make(2)
     with pytest.raises(SimulationError, match=r"action has shape \(2, 3\), expected \(2, 2\)"):
         env.step(torch.zeros(2, 3))
 
 
-def test_any_simulator_that_a_package_brings_serves(make, monkeypatch):
-    """One of MuJoCo's threads under another name, whose options are fewer: it steps as MuJoCo's own does."""
+def test_a_simulator_from_a_package_can_be_used(make, monkeypatch):
+    """The registered one is MuJoCo's own under another name with fewer options, so it must step identically."""
 
-    class Mine(BatchSimulation):
+    class CustomSimulation(BatchSimulation):
         def __init__(self, touch, num_envs, *, substeps, keyframe, options, watch, on_fault):
             super().__init__(
                 touch,
@@ -407,12 +407,12 @@ def test_any_simulator_that_a_package_brings_serves(make, monkeypatch):
                 threads=1,
             )
 
-    mine = dataclasses.replace(SOURCES[0], name="mine", simulate=Mine, recognise=None)
-    monkeypatch.setattr(connect, "known_sources", lambda: (SOURCES[0], mine))
+    custom = dataclasses.replace(SOURCES[0], name="mine", simulate=CustomSimulation, recognise=None)
+    monkeypatch.setattr(connect, "known_sources", lambda: (SOURCES[0], custom))
     env, other = make(3, simulator="mine"), make(3, simulator="mujoco")
-    assert isinstance(env.sim, Mine)
+    assert isinstance(env.sim, CustomSimulation)
     for _ in range(3):
-        one, two = (own.step(torch.full((3, 2), 0.3)) for own in (env, other))
+        one, two = (each.step(torch.full((3, 2), 0.3)) for each in (env, other))
     assert torch.equal(one.reward, two.reward) and torch.equal(one.obs["proprio"], two.obs["proprio"])
     with pytest.raises(SimulationError, match='simulator is "min"; did you mean "mine"'):
         make(3, simulator="min")
@@ -421,7 +421,7 @@ def test_any_simulator_that_a_package_brings_serves(make, monkeypatch):
 
 
 def test_joints_are_observed_with_noise_and_scaled(tmp_path):
-    """Positions and velocities, not actions, and nothing that is privileged; other numbers at each step, the same ones again."""
+    """Noise is on positions and velocities, not on actions or privileged groups; it differs per step and repeats with the seed."""
     more = "proprio: {pos_noise: 0.01 rad, vel_noise: 0.3, vel_scale: 0.2}\n"
     env = tiny_env(tmp_path, 500, more=more)
     first, noise = env.observe()["proprio"], []

@@ -1,4 +1,4 @@
-"""States of environments: saved, gone on from, and refused where they are of others."""
+"""States of environments: saved, resumed, and refused by other environments."""
 
 import pytest
 import torch
@@ -15,7 +15,7 @@ def make(tmp_path):
 
 
 @pytest.mark.parametrize("joint_vel", ["exact", "measured"])
-def test_stop_and_go_on_is_bit_for_bit(make, joint_vel):
+def test_resuming_is_exact_to_the_bit(make, joint_vel):
     more = NOISY + RANDOM + f"episode: 0.2 s\njoint_vel: {joint_vel}\n"
     env, other = make(more=more, seed=1), make(more=more, seed=9)
     for action in actions(env, 5):
@@ -25,10 +25,10 @@ def test_stop_and_go_on_is_bit_for_bit(make, joint_vel):
     for _ in range(3):
         other.step(torch.ones(4, 2))
     assert same(other.load_state_dict(saved), saved["obs"])
-    for action, before in zip(actions(env, STEPS, 1), expected, strict=True):
-        made = other.step(action)
-        assert same(made.obs, before.obs) and torch.equal(made.reward, before.reward)
-        assert torch.equal(made.info.episode_return, before.info.episode_return)
+    for action, expected_result in zip(actions(env, STEPS, 1), expected, strict=True):
+        result = other.step(action)
+        assert same(result.obs, expected_result.obs) and torch.equal(result.reward, expected_result.reward)
+        assert torch.equal(result.info.episode_return, expected_result.info.episode_return)
     with pytest.raises(SimulationError, match="of other environments"):
         make(5, more=more).load_state_dict(saved)
     fresh = make(more=more, seed=9)
@@ -36,37 +36,41 @@ def test_stop_and_go_on_is_bit_for_bit(make, joint_vel):
     assert torch.equal(fresh.step(actions(env, 1, 1)[0]).reward, expected[0].reward)
 
 
-def test_a_state_from_before_the_first_step_is_gone_on_from_after_some(make):
+def test_a_state_saved_before_the_first_step_can_be_resumed_later(make):
     env = make(more=NOISY + RANDOM, seed=1)
     saved = env.state_dict()
     expected = [env.step(action) for action in actions(env, 3)]
     env.load_state_dict(saved)
-    for action, before in zip(actions(env, 3), expected, strict=True):
-        made = env.step(action)
-        assert same(made.obs, before.obs) and torch.equal(made.info.episode_return, before.info.episode_return)
-        assert all(torch.equal(total, before.info.episode_terms[name]) for name, total in made.info.episode_terms.items())
+    for action, expected_result in zip(actions(env, 3), expected, strict=True):
+        result = env.step(action)
+        assert same(result.obs, expected_result.obs) and torch.equal(
+            result.info.episode_return, expected_result.info.episode_return
+        )
+        assert all(
+            torch.equal(total, expected_result.info.episode_terms[name]) for name, total in result.info.episode_terms.items()
+        )
 
 
-def test_what_is_read_is_there_again_after_a_loaded_states_next_step(make):
+def test_readings_are_available_one_step_after_loading_a_state(make):
     env = make(more="touch: depth\n", seed=1)
     saved = env.state_dict()
     env.load_state_dict(saved)
-    for told in (lambda: env.now, env.images):
+    for read in (lambda: env.now, env.images):
         with pytest.raises(SimulationError, match="a state was loaded: its readings are available after the next step"):
-            told()
+            read()
     env.step(torch.zeros(4, 2))
     assert env.now.object.pos.shape == (4, 3)
 
 
 @pytest.mark.parametrize("is_begun", [False, True])
-def test_a_state_of_other_environments_changes_nothing(make, is_begun):
+def test_a_refused_state_changes_nothing(make, is_begun):
     env, other = make(more=NOISY + RANDOM, seed=1), make(more=NOISY + RANDOM, seed=9)
     for each in (env, other) if is_begun else (env,):
         each.step(torch.ones(4, 2))
     saved, before = env.state_dict(), other.state_dict()
-    cases = [({name: own for name, own in saved.items() if name != part}, part) for part in saved if part != "sim"]
+    cases = [({name: value for name, value in saved.items() if name != part}, part) for part in saved if part != "sim"]
     cases += [
-        ({name: own for name, own in saved.items() if name != "sim"}, "the state of another simulation: state/time"),
+        ({name: value for name, value in saved.items() if name != "sim"}, "the state of another simulation: state/time"),
         (saved | {"sim": dict(list(saved["sim"].items())[1:])}, "the state of another simulation: state/time missing"),
     ]
     for part in ("touch", "obs", "seed", "actuation"):
@@ -79,6 +83,6 @@ def test_a_state_of_other_environments_changes_nothing(make, is_begun):
             other.load_state_dict(state)
     after = other.state_dict()
     assert after.keys() == before.keys()
-    for part, own in before.items():
-        assert own.keys() == after[part].keys() and all(torch.equal(own[name], after[part][name]) for name in own)
+    for part, value in before.items():
+        assert value.keys() == after[part].keys() and all(torch.equal(value[name], after[part][name]) for name in value)
     other.step(torch.ones(4, 2))

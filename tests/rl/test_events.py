@@ -1,4 +1,4 @@
-"""Events of a document: what they change, when they happen, and that the others are left alone."""
+"""Events of a document: what they change, when they occur, and that other environments stay unchanged."""
 
 import numpy as np
 import pytest
@@ -16,15 +16,15 @@ def lift(event, speed: Number, times: float = 1.0):
 """
 
 
-def flying(folder, more, num_envs=4, **options):
-    """Return environments whose ball flies without gravity, above all that it could touch."""
+def flying_envs(folder, more, num_envs=4, **options):
+    """Return environments whose ball floats without gravity, out of reach of everything."""
     env = tiny_env(folder, num_envs, gravity="0 0 0", more=more, **options)
     env.sim.qpos[:, 5] = 1.0
     return env
 
 
-def changes(env, steps):
-    """Return of each control step by how much the ball's velocities differ from those before it: (step, env, 6)."""
+def velocity_changes(env, steps):
+    """Return the change of the ball's velocities in each control step: (step, env, 6)."""
     rows = [env.sim.qvel[:, 3:9].clone()]
     for _ in range(steps):
         env.step(torch.zeros(env.num_envs, 2))
@@ -32,28 +32,28 @@ def changes(env, steps):
     return torch.stack(rows).diff(dim=0).numpy()
 
 
-def test_a_free_ball_is_given_velocity_within_bounds_at_intervals_within_bounds(tmp_path):
-    """The ball is a sphere: without forces linear and angular velocity stay as they are."""
-    env = flying(tmp_path, KNOCK)
-    found = changes(env, 60)
-    for row in found.swapaxes(0, 1):
-        at = np.flatnonzero(np.abs(row).max(axis=1) > 1e-9)
-        gaps = np.diff(at)
-        assert len(at) >= 8 and gaps.min() >= 4 and gaps.max() <= 8 and len(set(gaps)) > 1
-        knocks = row[at]
+def test_knocks_have_sizes_and_intervals_within_bounds(tmp_path):
+    """Without forces a sphere keeps its linear and angular velocity."""
+    env = flying_envs(tmp_path, KNOCK)
+    jumps = velocity_changes(env, 60)
+    for row in jumps.swapaxes(0, 1):
+        steps = np.flatnonzero(np.abs(row).max(axis=1) > 1e-9)
+        gaps = np.diff(steps)
+        assert len(steps) >= 8 and gaps.min() >= 4 and gaps.max() <= 8 and len(set(gaps)) > 1
+        knocks = row[steps]
         assert (knocks[:, :3] > 0.1 - 1e-6).all() and (knocks[:, :3] < 0.2 + 1e-6).all()
         assert (knocks[:, 3:] > 1 - 1e-6).all() and (knocks[:, 3:] < 2 + 1e-6).all()
-        assert np.unique(knocks[:, 0]).size == len(at)
+        assert np.unique(knocks[:, 0]).size == len(steps)
 
 
-def test_numbers_do_not_depend_on_the_batch(tmp_path):
-    """Each environment has its own, whichever others there are."""
+def test_events_do_not_depend_on_the_batch(tmp_path):
+    """Each environment draws its own numbers, whichever others there are."""
     (tmp_path / "a").mkdir(), (tmp_path / "b").mkdir()
-    all_of_them, last = flying(tmp_path / "a", KNOCK, 4), flying(tmp_path / "b", KNOCK, 2, first_env=2)
-    np.testing.assert_array_equal(changes(all_of_them, 20)[:, 2:], changes(last, 20))
+    whole, last = flying_envs(tmp_path / "a", KNOCK, 4), flying_envs(tmp_path / "b", KNOCK, 2, first_env=2)
+    np.testing.assert_array_equal(velocity_changes(whole, 20)[:, 2:], velocity_changes(last, 20))
 
 
-def test_a_function_of_ones_own_happens_at_each_reset(tmp_path):
+def test_a_user_defined_function_runs_at_each_reset(tmp_path):
     (tmp_path / "own.py").write_text(OWN)
     more = 'terms: {lift: {term: "own.py:lift", mode: reset, speed: 0.5, times: 2}}\nepisode: 0.5 s\n'
     env = tiny_env(tmp_path, 3, gravity="0 0 0", more=more)
@@ -61,14 +61,14 @@ def test_a_function_of_ones_own_happens_at_each_reset(tmp_path):
     for _ in range(3):
         env.step(torch.zeros(3, 2))
     env.steps[1] = env.max_steps  # the next step ends this episode alone
-    before = env.sim.qvel[:, 5].clone()
+    velocity = env.sim.qvel[:, 5].clone()
     env.step(torch.zeros(3, 2))
     assert env.sim.qvel[1, 5].item() == pytest.approx(1.0)
-    torch.testing.assert_close(env.sim.qvel[[0, 2], 5], before[[0, 2]])
+    torch.testing.assert_close(env.sim.qvel[[0, 2], 5], velocity[[0, 2]])
 
 
-def test_what_is_random_at_resets_may_be_drawn_again_at_intervals(tmp_path):
-    """Friction, mass and drives: within their ranges, of other numbers each time, and the same in the simulation."""
+def test_random_properties_can_be_redrawn_at_intervals(tmp_path):
+    """Friction, mass and drives stay in range, differ between draws, and reach the simulation."""
     more = """randomise: {drive: {gain: [0.5, 1.5]}}
 episode: 60 s
 terms:
@@ -76,7 +76,7 @@ terms:
   heavy: {term: mass, added: [100 g, 200 g]}
   wear: {term: drive, mode: interval, interval: [0.1 s, 0.2 s]}
 """
-    env = flying(tmp_path, more)
+    env = flying_envs(tmp_path, more)
     setup, properties = env.task.setup, env.sim.properties
     rows = []
     for _ in range(60):
@@ -107,44 +107,44 @@ terms:
         ),
     ],
 )
-def test_the_short_form_is_an_event_of_its_own_random_numbers(tmp_path, short, term):
-    """Of many environments, the short form and the term have the same means and ranges; of each, other numbers."""
+def test_the_short_form_and_the_term_draw_different_numbers(tmp_path, short, term):
+    """Over many environments both have the same mean and range; in each environment the numbers differ."""
     (tmp_path / "a").mkdir(), (tmp_path / "b").mkdir()
-    one = flying(tmp_path / "a", f"randomise: {{{short}}}\nepisode: 60 s\n", 64)
-    two = flying(tmp_path / "b", f"terms: {{other: {{term: {term}}}}}\nepisode: 60 s\n", 64)
-    found = []
+    one = flying_envs(tmp_path / "a", f"randomise: {{{short}}}\nepisode: 60 s\n", 64)
+    two = flying_envs(tmp_path / "b", f"terms: {{other: {{term: {term}}}}}\nepisode: 60 s\n", 64)
+    samples = []
     for env in (one, two):
         for _ in range(9):
             env.step(torch.zeros(64, 2))
         setup = env.task.setup
-        found.append(torch.stack([setup.friction, setup.mass, env.sim.qvel[:, 3]]).numpy())
-    moved = [i for i in range(3) if np.ptp(found[0][i]) > 1e-9]
-    assert len(moved) == 1 and not np.array_equal(*(rows[moved[0]] for rows in found))
-    low, high = (getattr(found[0][moved[0]], end)() for end in ("min", "max"))
-    assert abs(found[1][moved[0]].mean() - found[0][moved[0]].mean()) < 0.25 * (high - low)
-    others = [i for i in range(3) if i not in moved]
-    np.testing.assert_array_equal(found[0][others], found[1][others])
+        samples.append(torch.stack([setup.friction, setup.mass, env.sim.qvel[:, 3]]).numpy())
+    varied = [i for i in range(3) if np.ptp(samples[0][i]) > 1e-9]
+    assert len(varied) == 1 and not np.array_equal(*(rows[varied[0]] for rows in samples))
+    low, high = (getattr(samples[0][varied[0]], end)() for end in ("min", "max"))
+    assert abs(samples[1][varied[0]].mean() - samples[0][varied[0]].mean()) < 0.25 * (high - low)
+    constant = [i for i in range(3) if i not in varied]
+    np.testing.assert_array_equal(samples[0][constant], samples[1][constant])
 
 
-def test_a_saved_environment_goes_on_with_its_events(tmp_path):
-    env = flying(tmp_path, KNOCK)
-    changes(env, 7)
-    again = tiny_env(tmp_path, gravity="0 0 0", more=KNOCK)
-    again.load_state_dict(env.state_dict())
-    np.testing.assert_array_equal(changes(again, 20), changes(env, 20))
+def test_a_saved_environment_resumes_with_its_events(tmp_path):
+    env = flying_envs(tmp_path, KNOCK)
+    velocity_changes(env, 7)
+    resumed = tiny_env(tmp_path, gravity="0 0 0", more=KNOCK)
+    resumed.load_state_dict(env.state_dict())
+    np.testing.assert_array_equal(velocity_changes(resumed, 20), velocity_changes(env, 20))
 
 
-def test_a_saved_environment_goes_on_within_a_push(tmp_path):
+def test_a_saved_environment_resumes_within_a_push(tmp_path):
     more = (
         "randomise: {push: {x: [1 N, 2 N], interval: [0.1 s, 0.1 s], duration: 0.1 s}}\nepisode: 60 s\ndrop_distance: 100 m\n"
     )
-    env, again = flying(tmp_path, more), tiny_env(tmp_path, gravity="0 0 0", more=more)
-    assert not changes(env, 3).any() and changes(env, 2)[-1, :, 0].all()
-    again.load_state_dict(env.state_dict())
-    np.testing.assert_array_equal(changes(again, 20), changes(env, 20))
+    env, resumed = flying_envs(tmp_path, more), tiny_env(tmp_path, gravity="0 0 0", more=more)
+    assert not velocity_changes(env, 3).any() and velocity_changes(env, 2)[-1, :, 0].all()
+    resumed.load_state_dict(env.state_dict())
+    np.testing.assert_array_equal(velocity_changes(resumed, 20), velocity_changes(env, 20))
 
 
-def test_what_is_wrong_with_an_event_is_told(tmp_path):
+def test_errors_in_an_event_are_reported(tmp_path):
     (tmp_path / "own.py").write_text(OWN)
     with pytest.raises(SpecError, match="unknown key"):
         load_task(write_task(tmp_path, more='terms: {lift: {term: "own.py:lift", speed: 1, height: 2}}\n'))
@@ -154,8 +154,8 @@ def test_what_is_wrong_with_an_event_is_told(tmp_path):
         tiny_env(tmp_path, more=KNOCK.replace("0.1 s, 0.2 s", "1 ms, 0.2 s"))
 
 
-def test_a_document_places_the_object(tmp_path):
-    """Within bounds along x and y, turned about the vertical, and otherwise as the keyframe has it."""
+def test_a_document_can_randomise_the_objects_placement(tmp_path):
+    """Within bounds along x and y, turned about the vertical, otherwise as in the keyframe."""
     env = tiny_env(tmp_path, 32, more="terms: {place: {term: placement, xy: [1 mm, 2 mm], yaw: [0.2, 0.3]}}\n")
     pos, quat = env.sim.qpos[:, 3:6].numpy(), env.sim.qpos[:, 6:10].numpy()
     assert (pos[:, :2] > 1e-3 - 1e-9).all() and (pos[:, :2] < 2e-3 + 1e-9).all() and np.unique(pos[:, 0]).size == 32

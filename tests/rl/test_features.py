@@ -1,4 +1,4 @@
-"""Descriptions of observations: a description and MuJoCo's raw state are enough to compute the observation."""
+"""Descriptions of observations: with MuJoCo's raw state they suffice to recompute the observation."""
 
 import math
 import re
@@ -13,13 +13,13 @@ from tiny_tasks import RADIUS, tiny_env
 from tgdsl.rl.sensed import Felt
 
 PLAIN = {"physics.substeps": 1, "touch": "depth", "proprio.vel_scale": 0.2}
-"""With one physics step, readings are of where the control step began."""
+"""With one physics step, readings are those at the start of the control step."""
 TASKS = {"in_palm_rotate": (tiny_env, {}), "screwdriver": (pincer_env, {"variants": [0], "action.slide_scale": 1e-4})}
 GIVEN = ("qpos", "qvel", "ctrl", "qfrc_applied", "xfrc_applied", "qacc_warmstart")
 
 
 class Raw:
-    """MuJoCo's state of one environment, and what follows from it by MuJoCo's own functions."""
+    """MuJoCo's state of one environment, and quantities that MuJoCo's own functions derive from it."""
 
     def __init__(self, env, arrays, action, start):
         self.env, self.action, self.start = env, action, start
@@ -33,25 +33,25 @@ class Raw:
         return self.data.body(body).xmat.reshape(3, 3)
 
     def force_on(self, link, body):
-        """The body's force on a link, in world axes."""
+        """Return the body's force on a link, in world axes."""
         total, force = np.zeros(3), np.zeros(6)
         for i, side in self.contacts(link, body):
-            mujoco.mj_contactForce(self.model, self.data, i, force)  # of the first geom on the second
+            mujoco.mj_contactForce(self.model, self.data, i, force)  # from the first geom on the second
             total += side * self.data.contact[i].frame.reshape(3, 3).T @ force[:3]
         return total
 
     def contacts(self, link, body):
-        """Contacts of a body with a link, and 1 where the link is the second of both, else −1."""
-        found = []
+        """Return (contact, sign) of a body with a link: 1 if the link is second, else −1."""
+        signed_contacts = []
         for i, contact in enumerate(self.data.contact[: self.data.ncon]):
             bodies = [self.model.body(self.model.geom_bodyid[geom]).name for geom in contact.geom]
             if sorted(bodies) == sorted((link, body)):
-                found.append((i, 1 if bodies[1] == link else -1))
-        return found
+                signed_contacts.append((i, 1 if bodies[1] == link else -1))
+        return signed_contacts
 
     def signed_distance(self, point, body):
-        """To the surface of a body of boxes and spheres."""
-        found = []
+        """Return the distance to the surface of a body of boxes and spheres."""
+        distances = []
         for geom in np.flatnonzero(self.model.geom_bodyid == self.model.body(body).id):
             if not self.model.geom_contype[geom] and not self.model.geom_conaffinity[geom]:
                 continue
@@ -62,24 +62,24 @@ class Raw:
             else:
                 assert self.model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE
                 off = np.array([np.linalg.norm([x, y, z]) - size[0]])
-            found.append(np.linalg.norm(np.maximum(off, 0)) + min(0, off.max()))
-        return min(found)
+            distances.append(np.linalg.norm(np.maximum(off, 0)) + min(0, off.max()))
+        return min(distances)
 
     def probes(self, features):
-        """Places in the world and radii of the probes that features are of."""
+        """Yield world position and radius of each probe of the features."""
         for row in self.env.touch.rows[features.sensor][features.rows.start : features.rows.stop]:
             assert row["link"] == features.link
             body = row["body"]
             yield self.data.body(body).xpos + self.rotation(body) @ row["pos"], row["radius"]
 
     def goal(self):
-        """The first quarter turn about the vertical."""
+        """Return the first goal: a quarter turn about the vertical."""
         quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
         return quarter @ self.start
 
 
-def rebuilt(raw, features, body):
-    """Follow the description of some features."""
+def rebuild(raw, features, body):
+    """Compute features from their description."""
     name, frame = features.name, features.frame
     if joint := re.fullmatch(r"(position|velocity) of (\w+)", name):
         value = raw.data.joint(joint[2]).qpos if joint[1] == "position" else raw.data.joint(joint[2]).qvel
@@ -123,45 +123,45 @@ def test_an_observation_can_be_rebuilt_from_its_description(tmp_path, name):
     data = mujoco.MjData(env.sim.env_model(0))
     data.qpos[:] = env.sim.qpos[0].numpy()
     mujoco.mj_kinematics(env.sim.env_model(0), data)
-    start, seen = data.body(body).xmat.reshape(3, 3).copy(), set()
+    start, nonzero_names = data.body(body).xmat.reshape(3, 3).copy(), set()
     for step in range(40):
         action = 0.6 * torch.rand((1, env.num_actions), generator=generator) - 0.3
         if name == "in_palm_rotate":
             env.sim.qpos[0, 3:6] = torch.tensor([0.0255, 0.0, RADIUS])  # 0.5 mm in the right plate
-        before = {name: env.sim.arrays[name][0].clone().numpy() for name in GIVEN}
-        made = env.step(action)
-        assert not made.info.ended
+        state_before = {name: env.sim.arrays[name][0].clone().numpy() for name in GIVEN}
+        result = env.step(action)
+        assert not result.info.ended
         if step < 10 or step % 6:
             continue
-        after = {name: env.sim.arrays[name][0].numpy() for name in ("ctrl", "qfrc_applied", "xfrc_applied")}
-        raw = Raw(env, before | after, action[0].numpy(), start)
+        state_after = {name: env.sim.arrays[name][0].numpy() for name in ("ctrl", "qfrc_applied", "xfrc_applied")}
+        raw = Raw(env, state_before | state_after, action[0].numpy(), start)
         for group, parts in description.items():
             assert parts[-1][0].stop == env.groups[group]
             for place, features in parts:
-                value = made.obs[group][0, place].numpy()
-                expected = rebuilt(raw, features, body)
+                value = result.obs[group][0, place].numpy()
+                expected = rebuild(raw, features, body)
                 scale = max(1.0, float(np.abs(expected).max()))
                 np.testing.assert_allclose(value, expected, rtol=0, atol=1e-6 * scale, err_msg=f"{group}: {features}")
-                seen |= {features.name} if np.abs(value).max() > 0 else set()
-    assert {"depth", "distance", "force_x, force_y, force_z"} <= seen
+                nonzero_names |= {features.name} if np.abs(value).max() > 0 else set()
+    assert {"depth", "distance", "force_x, force_y, force_z"} <= nonzero_names
     env.close()
 
 
-def test_students_that_feel_parts_of_a_sensor_are_described(tmp_path):
+def test_partial_readings_of_a_sensor_are_described(tmp_path):
     felts = [Felt("agg_force", "left", "clean"), Felt("force", "right", "clean"), Felt("agg_bool", "hand", "clean")]
     env = tiny_env(tmp_path, 1, feels=[*felts, Felt("force", "left", "clean")])
-    force, touched, bits = (env.describe()[felt.group] for felt in felts)
+    force, taxel_forces, bits = (env.describe()[felt.group] for felt in felts)
     sums = [(f"sum of depth times normal, {axis}", "left", 1e4, 1) for axis in "zyx"]
     assert [(each.name, each.link, each.scale, each.size) for _, each in force] == sums
     names = [(f"force_{axis}", "right", range(2, 4)) for axis in "xyz"]
-    assert [(each.name, each.link, each.rows) for _, each in touched] == names
+    assert [(each.name, each.link, each.rows) for _, each in taxel_forces] == names
     assert [(each.link, each.name) for _, each in bits] == [
         (link, "contact of more than 2 taxels") for link in ("left", "right")
     ]
     env.close()
 
 
-def test_calls_that_a_sensor_stacks_are_told_apart(tmp_path):
+def test_stacked_readings_are_described_separately(tmp_path):
     env = tiny_env(tmp_path, 1, more="touch: depth\nsensors: {depth: {history: 2}}\n")
     parts = env.describe()["tactile_sensors"]
     names = [(f"depth of call {call}", link) for call in (0, 1) for link in ("left", "right")]
@@ -169,7 +169,7 @@ def test_calls_that_a_sensor_stacks_are_told_apart(tmp_path):
     env.close()
 
 
-def test_it_prints_units_and_names_what_is_not_described(tmp_path):
+def test_descriptions_print_units_and_mark_undescribed_groups(tmp_path):
     (tmp_path / "own.py").write_text(
         "from tgdsl.rl.terms import ObservationTerm\nclass Own(ObservationTerm):\n"
         "    def observe(self, now, setup):\n        return now.joint_pos\n"

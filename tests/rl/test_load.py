@@ -1,4 +1,4 @@
-"""Documents of tasks: what is wrong is told at its place, with what would be right."""
+"""Loading task documents: errors are reported at their place, with a hint."""
 
 import json
 import sys
@@ -26,14 +26,14 @@ REPOSITORY = Path(__file__).parents[2]
 DOCUMENTS = sorted(
     path
     for path in (REPOSITORY / "examples" / "tasks").glob("*.yaml")
-    if "\ntask:" in (text := path.read_text(encoding="utf-8")) and "\nmatrix:" not in text  # that is a sweep
+    if "\ntask:" in (text := path.read_text(encoding="utf-8")) and "\nmatrix:" not in text  # a sweep
 )
 
 
-def problems(call):
-    """Return the mistakes that a call is refused with."""
+def problems(load):
+    """Return the problems reported by a call that must fail."""
     with pytest.raises(SpecError) as caught:
-        call()
+        load()
     return caught.value.problems
 
 
@@ -56,16 +56,16 @@ def problems(call):
         ("color: red\n", 8, "color", "unknown key"),
     ],
 )
-def test_what_is_wrong_is_told_at_its_place(tmp_path, more, line, path, says):
+def test_errors_are_reported_at_their_place(tmp_path, more, line, path, says):
     task = write_task(tmp_path, more=more)
-    (found,) = problems(lambda: load_task(task))
-    assert (found.file, found.line, found.path) == (str(task), line, path)
-    assert says in f"{found.what} {found.hint}"
+    (problem,) = problems(lambda: load_task(task))
+    assert (problem.file, problem.line, problem.path) == (str(task), line, path)
+    assert says in f"{problem.what} {problem.hint}"
 
 
-def test_all_mistakes_are_told_at_once(tmp_path):
+def test_all_errors_are_reported_at_once(tmp_path):
     task = write_task(tmp_path, more="rewards: {spinn: 2}\nepisode: x\n")
-    assert {found.path for found in problems(lambda: load_task(task))} == {"rewards.spinn", "episode"}
+    assert {problem.path for problem in problems(lambda: load_task(task))} == {"rewards.spinn", "episode"}
 
 
 @pytest.mark.parametrize(
@@ -83,16 +83,16 @@ def test_all_mistakes_are_told_at_once(tmp_path):
         ("in_palm_rotate", "pathlib:Paths", 2, "task", 'pathlib has no class "Paths"'),
     ],
 )
-def test_what_does_not_fit_the_scene_is_told_at_its_place(tmp_path, old, new, line, path, says):
+def test_mismatches_with_the_scene_are_reported_at_their_place(tmp_path, old, new, line, path, says):
     task = write_task(tmp_path)
     task.write_text(task.read_text().replace(old, new))
-    (found,) = problems(lambda: TouchEnv(task, 2))
-    assert (found.file, found.line, found.path) == (str(task), line, path)
-    assert says in found.what
+    (problem,) = problems(lambda: TouchEnv(task, 2))
+    assert (problem.file, problem.line, problem.path) == (str(task), line, path)
+    assert says in problem.what
 
 
-def test_a_task_replaces_what_the_sensors_document_says(tmp_path):
-    """It compiles as a document that says so itself, and its card has the radius."""
+def test_a_task_overrides_its_sensors_document(tmp_path):
+    """The result compiles as if the sensors' document had said so, and the policy's card has the radius."""
     task = write_task(tmp_path, more="touch: proximity\n")
     sensors = tmp_path / "sensors.yaml"
     text = sensors.read_text()
@@ -106,48 +106,48 @@ def test_a_task_replaces_what_the_sensors_document_says(tmp_path):
     assert arrays[0] == arrays[1] != arrays[2]
 
 
-def test_a_sensor_that_the_document_lacks_is_named(tmp_path):
+def test_a_missing_sensor_is_named(tmp_path):
     task = write_task(tmp_path, more="touch: proximity\n")
     sensors = tmp_path / "sensors.yaml"
-    whole = sensors.read_text()
-    sensors.write_text("\n".join(line for line in whole.splitlines() if "kind: proximity" not in line))
-    (found,) = problems(lambda: TouchEnv(task, 2))
-    assert found.path == "touch" and found.line == 8
-    assert found.what == '"sensors.yaml" has no sensor of kind "proximity", expected one'
-    assert found.hint.startswith("its sensors allow `touch` none, ") and "proximity" not in found.hint
-    sensors.write_text(whole + "  nearer: {kind: proximity, links: hand, feels: [ball]}\n")
-    (found,) = problems(lambda: TouchEnv(task, 2))
-    assert found.what == '"sensors.yaml" has the sensors near, nearer of kind "proximity", expected one'
-    sensors.write_text("\n".join(line for line in whole.splitlines() if "link_contact" not in line))
-    (found,) = problems(lambda: TouchEnv(task, 2))
-    assert found.path == "task" and '"link_contact"' in found.what
-    sensors.write_text("\n".join(line for line in whole.splitlines() if "link_contact" not in line and "proximity" not in line))
-    assert [found.path for found in problems(lambda: TouchEnv(task, 2))] == ["task", "touch"]  # all at once
+    text = sensors.read_text()
+    sensors.write_text("\n".join(line for line in text.splitlines() if "kind: proximity" not in line))
+    (problem,) = problems(lambda: TouchEnv(task, 2))
+    assert problem.path == "touch" and problem.line == 8
+    assert problem.what == '"sensors.yaml" has no sensor of kind "proximity", expected one'
+    assert problem.hint.startswith("its sensors allow `touch` none, ") and "proximity" not in problem.hint
+    sensors.write_text(text + "  nearer: {kind: proximity, links: hand, feels: [ball]}\n")
+    (problem,) = problems(lambda: TouchEnv(task, 2))
+    assert problem.what == '"sensors.yaml" has the sensors near, nearer of kind "proximity", expected one'
+    sensors.write_text("\n".join(line for line in text.splitlines() if "link_contact" not in line))
+    (problem,) = problems(lambda: TouchEnv(task, 2))
+    assert problem.path == "task" and '"link_contact"' in problem.what
+    sensors.write_text("\n".join(line for line in text.splitlines() if "link_contact" not in line and "proximity" not in line))
+    assert [problem.path for problem in problems(lambda: TouchEnv(task, 2))] == ["task", "touch"]  # all at once
 
 
-def test_a_group_of_links_that_the_layout_lacks_is_named(tmp_path):
+def test_an_unknown_group_of_links_is_named(tmp_path):
     task = write_task(tmp_path, more="placement: finger\n")
-    (found,) = problems(lambda: TouchEnv(task, 2))
-    assert (found.path, found.file) == ("placement", str(task)) and found.line > 0 and '"finger"' in found.what
+    (problem,) = problems(lambda: TouchEnv(task, 2))
+    assert (problem.path, problem.file) == ("placement", str(task)) and problem.line > 0 and '"finger"' in problem.what
 
 
-def test_a_document_without_a_task_names_those_there_are(tmp_path):
+def test_a_document_without_a_task_gets_a_list_of_tasks(tmp_path):
     (tmp_path / "task.yaml").write_text("tgdsl: 1\n")
-    (found,) = problems(lambda: load_task(tmp_path / "task.yaml"))
-    assert "in_palm_rotate" in found.what
+    (problem,) = problems(lambda: load_task(tmp_path / "task.yaml"))
+    assert "in_palm_rotate" in problem.what
 
 
 def test_values_are_set_by_dotted_path(tmp_path):
     task = write_task(tmp_path)
     spec = load_task(task, {"rewards.spin": 3, "randomise.friction": "[0.5, 2]", "episode": "2 s"}).spec
     assert (spec.rewards.spin, spec.randomise.friction, spec.episode) == (3.0, (0.5, 2.0), 2.0)
-    (found,) = problems(lambda: load_task(task, {"rewards.spinn": 3}))
-    assert found.file == "--set rewards.spinn=3"
-    (found,) = problems(lambda: load_task(task, {"terms.a.weight": 1}))
-    assert (found.file, found.path) == ("--set terms.a.weight=1", "terms.a.term")
+    (problem,) = problems(lambda: load_task(task, {"rewards.spinn": 3}))
+    assert problem.file == "--set rewards.spinn=3"
+    (problem,) = problems(lambda: load_task(task, {"terms.a.weight": 1}))
+    assert (problem.file, problem.path) == ("--set terms.a.weight=1", "terms.a.term")
 
 
-def test_a_task_of_ones_own_stands_beside_its_document(tmp_path):
+def test_a_user_defined_task_is_loaded_from_next_to_its_document(tmp_path):
     task = write_task(tmp_path, task="own.py:Own", more="extra: 4\n")
     (tmp_path / "own.py").write_text(
         "from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate, InPalmRotateSpec\n"
@@ -162,13 +162,13 @@ def test_a_task_of_ones_own_stands_beside_its_document(tmp_path):
     (tmp_path / "near_it.py").write_text("from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\n")
     (tmp_path / "other.py").write_text("import near_it\nclass Other(near_it.InPalmRotate):\n    pass\n")
     paths = list(sys.path)
-    beside = write_task(tmp_path, task="other.py:Other")
-    assert load_task(beside).task.__name__ == "Other" and sys.path == paths
+    other = write_task(tmp_path, task="other.py:Other")
+    assert load_task(other).task.__name__ == "Other" and sys.path == paths
     del sys.modules["near_it"]
     task = write_task(tmp_path, task="own.py:Own", more="extra: 4\n")
     task.write_text(task.read_text().replace("extra: 4", "extra: x"))
-    (found,) = problems(lambda: load_task(task))
-    assert found.path == "extra" and found.line == 8
+    (problem,) = problems(lambda: load_task(task))
+    assert problem.path == "extra" and problem.line == 8
 
 
 @pytest.mark.parametrize(
@@ -180,35 +180,38 @@ def test_a_task_of_ones_own_stands_beside_its_document(tmp_path):
         ("class Spec(InPalmRotate.Spec):\n    extra = 1", "PydanticUserError: A non-annotated attribute was detected"),
     ],
 )
-def test_what_the_file_of_a_task_of_ones_own_raises_is_told_with_its_line(tmp_path, line, says):
+def test_errors_in_a_user_defined_tasks_file_are_reported_with_their_line(tmp_path, line, says):
     (tmp_path / "code").mkdir()
-    own = tmp_path / "code" / "own.py"
-    own.write_text(f"from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\n{line}\n")
+    code = tmp_path / "code" / "own.py"
+    code.write_text(f"from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\n{line}\n")
     task = write_task(tmp_path, task="code/own.py:Own")
-    (found,) = problems(lambda: load_task(task))
-    assert (found.file, found.line, found.path) == (str(task), 2, "task")
-    assert found.what.startswith(f'cannot import "code/own.py:Own": {own}:2: {says}')
-    own.write_text("from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\nclass Owl(InPalmRotate):\n    pass\n")
-    (found,) = problems(lambda: load_task(task))
-    assert (found.what, found.hint) == ('code/own.py has no class "Own"', 'did you mean "Owl"?')
+    (problem,) = problems(lambda: load_task(task))
+    assert (problem.file, problem.line, problem.path) == (str(task), 2, "task")
+    assert problem.what.startswith(f'cannot import "code/own.py:Own": {code}:2: {says}')
+    code.write_text("from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\nclass Owl(InPalmRotate):\n    pass\n")
+    (problem,) = problems(lambda: load_task(task))
+    assert (problem.what, problem.hint) == ('code/own.py has no class "Own"', 'did you mean "Owl"?')
 
 
-def test_what_a_task_of_ones_own_lacks_is_named_at_once(tmp_path):
+def test_all_missing_members_of_a_user_defined_task_are_named(tmp_path):
     (tmp_path / "own.py").write_text(
         "from tgdsl.rl.task import Task\nfrom tgdsl.rl.spec import TaskSpec\nclass Own(Task[TaskSpec]):\n    pass\n"
     )
-    (found,) = problems(lambda: load_task(write_task(tmp_path, task="own.py:Own")))
-    assert found.what == '"own.py:Own" lacks advance, is_over, reset, score, Spec, score_unit'
+    (problem,) = problems(lambda: load_task(write_task(tmp_path, task="own.py:Own")))
+    assert problem.what == '"own.py:Own" lacks advance, is_over, reset, score, Spec, score_unit'
 
 
-def test_a_task_of_ones_own_senses_kinds_by_a_tuple(tmp_path):
+def test_senses_of_a_user_defined_task_must_be_a_tuple_of_kinds(tmp_path):
     code = "from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\nclass Own(InPalmRotate):\n    senses = {}\n"
     (tmp_path / "own.py").write_text(code.format('"link_contact"'))
     (tmp_path / "other.py").write_text(code.format('("link_contac",)'))
-    (found,) = problems(lambda: load_task(write_task(tmp_path, task="own.py:Own")))
-    assert (found.path, found.what) == ("task", '"own.py:Own": senses is "link_contact", expected a tuple, ("link_contact",)')
-    (found,) = problems(lambda: TouchEnv(write_task(tmp_path, task="other.py:Own"), 2))
-    assert (found.path, found.hint) == ("task", 'did you mean "link_contact"?')
+    (problem,) = problems(lambda: load_task(write_task(tmp_path, task="own.py:Own")))
+    assert (problem.path, problem.what) == (
+        "task",
+        '"own.py:Own": senses is "link_contact", expected a tuple, ("link_contact",)',
+    )
+    (problem,) = problems(lambda: TouchEnv(write_task(tmp_path, task="other.py:Own"), 2))
+    assert (problem.path, problem.hint) == ("task", 'did you mean "link_contact"?')
 
 
 @pytest.mark.parametrize(
@@ -243,7 +246,7 @@ def test_a_task_of_ones_own_senses_kinds_by_a_tuple(tmp_path):
         ),
     ],
 )
-def test_what_a_task_of_ones_own_returns_wrongly_is_named(tmp_path, method, says):
+def test_wrong_return_values_of_a_user_defined_task_are_named(tmp_path, method, says):
     (tmp_path / "own.py").write_text(
         f"from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\nclass Own(InPalmRotate):\n    {method}\n"
     )
@@ -252,23 +255,23 @@ def test_what_a_task_of_ones_own_returns_wrongly_is_named(tmp_path, method, says
         TouchEnv(task, 2, threads=1).step(torch.zeros(2, 2))
 
 
-def test_a_mapping_is_a_document_too(tmp_path, monkeypatch):
+def test_a_mapping_is_accepted_as_a_document(tmp_path, monkeypatch):
     task = write_task(tmp_path)
     monkeypatch.chdir(tmp_path)
     assert TouchEnv(YAML(typ="safe").load(task), 2, threads=1).num_actions == 2
 
 
-def test_joints_that_cannot_be_moved_to_targets_are_refused(tmp_path):
+def test_joints_without_position_servos_are_refused(tmp_path):
     task = write_task(tmp_path)
     robot = tmp_path / "tiny.xml"
     robot.write_text(
         robot.read_text().replace('<position name="left" joint="left" kp="1" kv="0.05"', '<motor name="left" joint="left"')
     )
-    (found,) = problems(lambda: TouchEnv(task, 2))
-    assert found.path == "joints" and "is no position servo" in found.what
+    (problem,) = problems(lambda: TouchEnv(task, 2))
+    assert problem.path == "joints" and "is no position servo" in problem.what
 
 
-def test_an_object_that_is_fixed_cannot_be_placed(tmp_path):
+def test_an_object_without_a_free_joint_cannot_be_placed(tmp_path):
     task = write_task(tmp_path)
     scene = tmp_path / "scene.xml"
     text = scene.read_text().replace('<freejoint name="ball"/>', '<joint name="ball" type="hinge"/>')
@@ -284,31 +287,31 @@ def test_an_unknown_simulator_is_refused(tmp_path):
 
 @cache
 def validator():
-    """Return a validator by the schema of the code."""
+    """Return a validator of the code's schema."""
     return jsonschema.Draft202012Validator(task_schema())
 
 
-def test_the_schema_in_the_repository_is_the_one_of_the_code():
-    kept = (REPOSITORY / "tgdsl.task.schema.json").read_text(encoding="utf-8")
-    assert kept == json.dumps(task_schema(), indent=2, ensure_ascii=False) + "\n", "run `tgdsl schema --tasks`"
+def test_the_schema_in_the_repository_is_up_to_date():
+    text = (REPOSITORY / "tgdsl.task.schema.json").read_text(encoding="utf-8")
+    assert text == json.dumps(task_schema(), indent=2, ensure_ascii=False) + "\n", "run `tgdsl schema --tasks`"
     jsonschema.Draft202012Validator.check_schema(task_schema())
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.stem)
-def test_documents_in_the_repository_are_good(path):
+def test_documents_in_the_repository_are_valid(path):
     assert load_task(path).spec.tgdsl == 1
     validator().validate(YAML(typ="safe").load(path))
 
 
 @pytest.mark.parametrize("more", ["rewards: {spinn: 2}", "touch: forse", "action: {scale: 3 mm}", "color: red", "task: rotate"])
-def test_editors_see_mistakes(tmp_path, more):
+def test_the_schema_rejects_mistakes(tmp_path, more):
     document = YAML(typ="safe").load(write_task(tmp_path)) | YAML(typ="safe").load(more)
     with pytest.raises(jsonschema.ValidationError):
         validator().validate(document)
 
 
-def test_a_task_without_sensors_is_evaluated(tmp_path):
-    """It looks at none unless it says so, and its policy may feel nothing: there are joints and an object all the same."""
+def test_a_task_without_sensors_can_be_evaluated(tmp_path):
+    """A task needs sensors only if it declares them; a policy may feel nothing. Joints and an object remain."""
     task = write_task(tmp_path)
     (tmp_path / "blind.py").write_text(
         "from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\n\n\n"
@@ -320,8 +323,8 @@ def test_a_task_without_sensors_is_evaluated(tmp_path):
     task.write_text(task.read_text().replace("in_palm_rotate", "blind.py:Blind"))
     env = TouchEnv(task, 2, overrides={"touch": "none"})
     assert env.reset()["proprio"].shape[0] == 2 and "tactile_sensors" not in env.groups
-    found = evaluate(env, ZeroActor(env), 2)
-    assert found.gait.coasting is None and found.gait.link_forces == {} and found.gait.max_speed > 0
+    evaluation = evaluate(env, ZeroActor(env), 2)
+    assert evaluation.gait.coasting is None and evaluation.gait.link_forces == {} and evaluation.gait.max_speed > 0
 
 
 class DeepestObservation(PerLink):
@@ -338,7 +341,7 @@ class DeepestObservation(PerLink):
         return (reading[:, :, channels[0], None] * constants["operator"]).amax(dim=1)
 
 
-def test_a_registered_observation_is_a_word_of_touch(tmp_path, monkeypatch):
+def test_a_registered_observation_is_a_value_of_touch(tmp_path, monkeypatch):
     with pytest.raises(SpecError, match='touch: unknown type "deepest"; did you mean "depth"'):
         load_task(write_task(tmp_path, more="touch: deepest\n"))
     monkeypatch.setattr(TYPES, "registered", (DeepestObservation,))
@@ -355,10 +358,10 @@ class SpinRate(RewardTerm):
         return now.object.angvel.norm(dim=1)
 
 
-def test_a_document_names_the_terms_of_packages(tmp_path, monkeypatch):
+def test_a_document_can_use_terms_of_packages(tmp_path, monkeypatch):
     task = write_task(tmp_path, more="terms: {whirl: {term: spin_rate, weight: 2}}\n")
-    (found,) = problems(lambda: load_task(task))
-    assert found.path == "terms.whirl.term" and 'there is no term "spin_rate"' in found.what
+    (problem,) = problems(lambda: load_task(task))
+    assert problem.path == "terms.whirl.term" and 'there is no term "spin_rate"' in problem.what
     monkeypatch.setattr(TERMS, "registered", (SpinRate,))
     assert load_task(task).terms == {"whirl": SpinRate(term="spin_rate", weight=2.0)}
     with pytest.raises(TgdslError, match="RewardTerm lacks rate"):

@@ -1,4 +1,4 @@
-"""What an environment draws is what its physics does: pushes, masses, frictions, drives; by their closed forms."""
+"""The simulation obeys what an environment draws: pushes, masses, frictions and drives, by closed forms."""
 
 from pathlib import Path
 
@@ -13,23 +13,23 @@ from tgdsl.rl.env import TouchEnv
 DOCUMENT = Path(__file__).parents[2] / "examples" / "tasks" / "in_palm_rotate.yaml"
 
 
-def test_a_push_moves_a_free_ball_as_force_by_mass(tmp_path):
-    """Δv = F Δt/m, with the mass that was drawn, at the control steps that were drawn."""
+def test_a_push_accelerates_a_free_ball_by_force_over_mass(tmp_path):
+    """Δv = F Δt/m, with the drawn mass, at the drawn control steps."""
     push = "randomise: {mass: [0, 200 g], push: {x: 0.1 N, interval: [0.1 s, 0.2 s], duration: 50 ms}}\n"
     env = tiny_env(tmp_path, 16, task="tiny_tasks:Coasting", gravity="0 0 0", more=push + "drop_distance: 10\nepisode: 0.6 s\n")
     env.reset(3)
     mass = env.now.mass.clone()
     assert mass.min() < 0.16 and mass.max() > 0.24
-    pushed, ball = torch.zeros(16), env.sim.model.body(env.task.setup.object).id
+    push_steps, ball = torch.zeros(16), env.sim.model.body(env.task.setup.object).id
     for _ in range(20):
         env.step(torch.zeros(16, 2))
-        pushed += env.sim.arrays["xfrc_applied"][:, ball, 0].float() / 0.1
+        push_steps += env.sim.arrays["xfrc_applied"][:, ball, 0].float() / 0.1
         speed = env.sim.qvel[:, 3]
-        torch.testing.assert_close(speed, (0.1 * 0.025 / mass) * pushed.double(), rtol=1e-9, atol=1e-15)
-    assert (pushed >= 2).all() and (pushed % 2 == 0).any()
+        torch.testing.assert_close(speed, (0.1 * 0.025 / mass) * push_steps.double(), rtol=1e-9, atol=1e-15)
+    assert (push_steps >= 2).all() and (push_steps % 2 == 0).any()
 
 
-def test_targets_arrive_as_late_as_was_drawn(tmp_path):
+def test_targets_arrive_with_the_drawn_delay(tmp_path):
     env = tiny_env(tmp_path, 32, gravity="0 0 0", more="randomise: {drive: {delay: [0, 3]}}\naction: {scale: 0.2}\n")
     env.reset(5)
     delay = env.actuation.drawn["delay"]
@@ -37,12 +37,12 @@ def test_targets_arrive_as_late_as_was_drawn(tmp_path):
     start = env.actuation.target.clone()
     for i in range(5):
         env.step(torch.ones(32, 2))
-        arrived = start + 0.2 * (i + 1 - delay).clamp(min=0.0)
-        torch.testing.assert_close(env.sim.ctrl[:, :2], arrived.clamp(max=0.8), rtol=0, atol=1e-12)
+        expected = start + 0.2 * (i + 1 - delay).clamp(min=0.0)
+        torch.testing.assert_close(env.sim.ctrl[:, :2], expected.clamp(max=0.8), rtol=0, atol=1e-12)
 
 
-def test_a_stalled_joint_has_the_strength_and_bias_that_were_drawn(tmp_path):
-    """Far from its target a drive exerts its largest torque; near it, stiffness times error, bias included."""
+def test_a_stalled_joint_has_the_drawn_strength_and_bias(tmp_path):
+    """Far from its target a drive exerts its largest torque; near it, stiffness times the biased error."""
     more = "randomise: {drive: {strength: [0.5, 1], bias: [-0.05, 0.05]}}\naction: {mode: absolute}\n"
     env = tiny_env(tmp_path, 16, gravity="0 0 0", more=more)
     env.reset(2)
@@ -60,8 +60,8 @@ def test_a_stalled_joint_has_the_strength_and_bias_that_were_drawn(tmp_path):
 
 
 @pytest.mark.slow
-def test_force_taxels_weigh_the_mass_that_was_drawn():
-    """At rest the forces on all taxels of the hand carry the object."""
+def test_force_taxels_weigh_the_drawn_mass():
+    """At rest, the forces on all taxels together carry the object."""
     overrides = {"touch": "force_taxel", "resolution": "high", "randomise.mass": "[0, 100 g]", "randomise.xy": 0.0}
     overrides |= {"randomise.drive": {}, "randomise.push": {}, "episode": "10 s"}
     env = TouchEnv(DOCUMENT, 16, threads=1, overrides=overrides)
@@ -70,8 +70,8 @@ def test_force_taxels_weigh_the_mass_that_was_drawn():
         env.step(torch.zeros(env.num_envs, env.num_actions))
     force = env.now.readings["load"].double()
     body = [env.sim.model.body(name).id for name in env.touch.taxels["load"]["body"].tolist()]
-    turn = torch.from_numpy(np.asarray(env.sim.batch.xquat)[:, body])
-    total = rotated(turn, force).sum(dim=1).numpy()
+    quat = torch.from_numpy(np.asarray(env.sim.batch.xquat)[:, body])
+    total = rotated(quat, force).sum(dim=1).numpy()
     weight = 9.81 * env.now.mass.numpy()
     assert weight.std() > 0.1
     np.testing.assert_allclose(-total[:, 2], weight, rtol=0.02)

@@ -1,4 +1,4 @@
-"""Pushes: a free ball gains F Δt / m, intervals and forces are those drawn, and only chosen environments begin again."""
+"""Pushes: a free ball gains F Δt / m, intervals and forces stay in range, and only chosen environments restart."""
 
 from types import SimpleNamespace
 
@@ -29,7 +29,7 @@ PAPER = PushSpec(x=(-1, 1), y=(-1, 1), z=(-5, 0))
 
 
 class Pushes(Events):
-    """The events of `randomise: {push: …}` on the ball of a simulation, or of arrays alone."""
+    """The events of `randomise: {push: …}` on a simulation's ball, or on bare arrays."""
 
     def __init__(self, spec, arrays, draws):
         applied = arrays["xfrc_applied"]
@@ -44,7 +44,7 @@ class Pushes(Events):
         self.reset(torch.tensor(chosen), torch.tensor(episode), is_placed=True)
 
 
-def begun(spec=PAPER, num_envs=1, seed=0, first_env=0, episode=1):
+def started_pushes(spec=PAPER, num_envs=1, seed=0, first_env=0, episode=1):
     applied = torch.zeros(num_envs, 3, 6, dtype=torch.float64)
     pushes = Pushes(spec, {"xfrc_applied": applied}, Draws(seed, num_envs, first_env=first_env))
     pushes.begin([True] * num_envs, [episode] * num_envs)
@@ -77,36 +77,36 @@ def test_a_free_ball_gains_force_times_time_over_mass(tmp_path, simulator, durat
 
 
 def test_intervals_and_forces_are_uniform_in_their_ranges():
-    num, pushes, applied = 1000, *begun(num_envs=1000)
-    waits, forces, since = [], [], np.zeros(num)
+    num, pushes, applied = 1000, *started_pushes(num_envs=1000)
+    waits, forces, steps_since = [], [], np.zeros(num)
     for _ in range(500):
         pushes.advance()
         is_pushed = pushes.force.any(dim=1).numpy()
         assert not applied[:, :2].any() and not applied[:, 2, 3:].any()
-        since += 1
-        waits += since[is_pushed].tolist()
+        steps_since += 1
+        waits += steps_since[is_pushed].tolist()
         forces += pushes.force[torch.from_numpy(is_pushed)].tolist()
-        since[is_pushed] = -1  # the push itself takes a step
+        steps_since[is_pushed] = -1  # the push itself takes a step
     first = np.array(waits[:num])
     assert first.min() == 80 and first.max() == 160
     assert abs(first.mean() - 120) < 5 * np.sqrt((81**2 - 1) / 12 / num)
-    found = np.array(forces)
+    all_forces = np.array(forces)
     for axis, (low, high) in enumerate((PAPER.x, PAPER.y, PAPER.z)):
-        assert low <= found[:, axis].min() and found[:, axis].max() <= high
-        assert abs(found[:, axis].mean() - (low + high) / 2) < 5 * (high - low) / np.sqrt(12 * len(found))
-    assert np.abs(np.corrcoef(found.T) - np.eye(3)).max() < 5 / np.sqrt(len(found))
+        assert low <= all_forces[:, axis].min() and all_forces[:, axis].max() <= high
+        assert abs(all_forces[:, axis].mean() - (low + high) / 2) < 5 * (high - low) / np.sqrt(12 * len(all_forces))
+    assert np.abs(np.corrcoef(all_forces.T) - np.eye(3)).max() < 5 / np.sqrt(len(all_forces))
 
 
-def test_pushes_are_the_same_for_64_environments_as_for_twice_32():
-    whole, halves = begun(num_envs=64)[0], [begun(num_envs=32, first_env=first)[0] for first in (0, 32)]
+def test_pushes_of_64_environments_equal_those_of_twice_32():
+    whole, halves = started_pushes(num_envs=64)[0], [started_pushes(num_envs=32, first_env=first)[0] for first in (0, 32)]
     for _ in range(400):
         for pushes in (whole, *halves):
             pushes.advance()
         assert torch.equal(whole.force, torch.cat([half.force for half in halves]))
 
 
-def test_only_chosen_environments_begin_anew():
-    pushes, _ = begun(PushSpec(x=(1, 1), interval=(0.05, 0.05), duration=10.0), num_envs=3)
+def test_only_the_chosen_environments_restart():
+    pushes, _ = started_pushes(PushSpec(x=(1, 1), interval=(0.05, 0.05), duration=10.0), num_envs=3)
     for _ in range(2):
         pushes.advance()
     assert pushes.force[:, 0].tolist() == [1, 1, 1]
@@ -117,6 +117,6 @@ def test_only_chosen_environments_begin_anew():
     assert pushes.force[:, 0].tolist() == [1, 1, 1]
 
 
-def test_what_cannot_be_is_named():
+def test_an_interval_below_the_control_step_is_refused():
     with pytest.raises(SimulationError, match=r'the event "push" comes every 0.01 s, more often than control steps of 0.025 s'):
-        begun(PushSpec(x=(1.0, 1.0), interval=(0.01, 1.0)))
+        started_pushes(PushSpec(x=(1.0, 1.0), interval=(0.01, 1.0)))

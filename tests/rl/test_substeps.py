@@ -1,4 +1,4 @@
-"""What is felt at each physics step, stacked: the same as environments feel that make one physics step per control step."""
+"""Stacked readings of all physics steps equal those of environments with one physics step per control step."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 
 @pytest.fixture
 def task(tmp_path):
-    """The document of a task whose fingertip feels depths."""
+    """Return the document of a task whose fingertip feels depths."""
     file = small_task(tmp_path)
     sensors = tmp_path / "sensors.yaml"
     text = sensors.read_text().replace("direction: [0, 0, -1]", "direction: [0, 0, 1]")
@@ -22,15 +22,15 @@ def task(tmp_path):
 
 @pytest.fixture
 def make(task):
-    made = []
+    envs = []
 
     def env(temporal, substeps):
         overrides = {"temporal": temporal, "touch": "depth", "physics.substeps": substeps, "action": {"mode": "absolute"}}
-        made.append(TouchEnv(task, 3, threads=1, overrides=overrides | {"episode": "10 s"}))
-        return made[-1]
+        envs.append(TouchEnv(task, 3, threads=1, overrides=overrides | {"episode": "10 s"}))
+        return envs[-1]
 
     yield env
-    for each in made:
+    for each in envs:
         each.close()
 
 
@@ -39,34 +39,34 @@ def actions(num):
     return [0.4 * torch.rand((3, 2), generator=generator) - 0.2 for _ in range(num)]
 
 
-def test_a_stack_has_what_is_felt_at_each_physics_step(make):
-    stacked, each = make("stack", 5), make("last", 1)
-    start = each.observe()["tactile_sensors"]
+def test_a_stack_holds_the_reading_of_each_physics_step(make):
+    stacked, single = make("stack", 5), make("last", 1)
+    start = single.observe()["tactile_sensors"]
     assert torch.equal(stacked.observe()["tactile_sensors"], start.repeat(1, 5))
-    seen = 0
+    num_varied = 0
     for action in actions(20):
-        found = stacked.step(action).obs["tactile_sensors"]
-        expected = torch.cat([each.step(action).obs["tactile_sensors"] for _ in range(5)], dim=1)
-        assert torch.equal(found, expected)
-        seen += len(expected.unique()) > 10
-    assert seen > 10
+        readings = stacked.step(action).obs["tactile_sensors"]
+        expected = torch.cat([single.step(action).obs["tactile_sensors"] for _ in range(5)], dim=1)
+        assert torch.equal(readings, expected)
+        num_varied += len(expected.unique()) > 10
+    assert num_varied > 10
 
 
 def test_an_episode_begins_with_a_stack_of_its_first_reading(make):
     env = make("stack", 5)
     env.steps[1] = env.max_steps - 4
     for action in actions(4):
-        made = env.step(action)
-    assert made.truncated.tolist() == [False, True, False]
+        result = env.step(action)
+    assert result.truncated.tolist() == [False, True, False]
 
-    def moves(obs):
-        felt = obs["tactile_sensors"].view(3, 5, -1)
-        return (felt != felt[:, :1]).any(dim=2).any(dim=1).tolist()
+    def changes_within_stack(obs):
+        stack = obs["tactile_sensors"].view(3, 5, -1)
+        return (stack != stack[:, :1]).any(dim=2).any(dim=1).tolist()
 
-    assert moves(made.info.final_obs) == [True] * 3 and moves(made.obs) == [True, False, True]
+    assert changes_within_stack(result.info.final_obs) == [True] * 3 and changes_within_stack(result.obs) == [True, False, True]
 
 
-def test_no_hand_feels_between_control_steps(task, tmp_path):
+def test_a_real_hand_cannot_feel_between_control_steps(task, tmp_path):
     policy = tmp_path / "policy.pt"
     torch.jit.save(torch.jit.trace(torch.nn.Linear(26, 2), torch.zeros(1, 26)), policy)
     with pytest.raises(DeployError, match=r"at each of 5 physics steps .* a hand feels once"):

@@ -1,4 +1,4 @@
-"""Terms that a document adds to its task: rewards, reasons to end, groups of observations; a user's own from a file."""
+"""Terms that a document adds to its task: rewards, terminations, observations, including user-defined ones."""
 
 from importlib import import_module
 
@@ -78,7 +78,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_terms_add_to_reward_end_and_observations(folder):
+def test_terms_add_to_reward_termination_and_observations(folder):
     more = """terms:
   height: {term: "own.py:Height", weight: -2, floor: 2 cm}
   hurry: {term: object_speed, weight: -0.5, free_speed: 1 mm/s, free_spin: 0.01}
@@ -102,32 +102,32 @@ def test_terms_add_to_reward_end_and_observations(folder):
         }
         for name, rate in expected.items():
             np.testing.assert_allclose(made.info.terms[name], env.control_step * rate, rtol=1e-5, atol=1e-9)
-        added = sum(made.info.terms[name] for name in expected)
-        np.testing.assert_allclose(made.reward - other.reward, added, rtol=1e-4, atol=1e-6)
+        extra = sum(made.info.terms[name] for name in expected)
+        np.testing.assert_allclose(made.reward - other.reward, extra, rtol=1e-4, atol=1e-6)
         np.testing.assert_allclose(made.obs["squares"], env.now.joint_pos.square(), rtol=1e-6)
     assert ended[0]
 
 
-def test_a_saved_environment_goes_on_with_its_terms(folder):
+def test_a_saved_environment_resumes_with_its_terms(folder):
     more = 'terms: {height: {term: "own.py:Height", weight: 1}, squares: {term: "own.py:Squares"}}\n'
-    env, again = tiny_env(folder, more=more), tiny_env(folder, more=more)
+    env, resumed = tiny_env(folder, more=more), tiny_env(folder, more=more)
     action = torch.full((4, 2), 0.3)
     env.step(action)
-    again.load_state_dict(env.state_dict())
-    one, two = env.step(action), again.step(action)
+    resumed.load_state_dict(env.state_dict())
+    one, two = env.step(action), resumed.step(action)
     assert torch.equal(one.reward, two.reward) and torch.equal(
         one.info.episode_terms["height"], two.info.episode_terms["height"]
     )
 
 
-def test_observations_are_one_graph(folder):
-    """Steps on a GPU are compiled: each break of the graph would launch kernels of its own."""
+def test_observations_compile_to_one_graph(folder):
+    """Steps on a GPU are compiled: each graph break would launch its own kernels."""
     env = tiny_env(folder, more="terms: {object: {term: object_state}}\ngoal: [orientation, difference, angle]\n")
-    found = torch.compile(env._observe, fullgraph=True, backend="eager")(env.now)
-    torch.testing.assert_close(found, env._observe(env.now), rtol=0, atol=0)
+    observations = torch.compile(env._observe, fullgraph=True, backend="eager")(env.now)
+    torch.testing.assert_close(observations, env._observe(env.now), rtol=0, atol=0)
 
 
-def test_terms_bring_the_sensors_that_they_look_at(folder):
+def test_terms_add_the_sensors_that_they_need(folder):
     env = tiny_env(folder, task="own.py:Idle", more="terms: {near: {weight: 1}}\n")
     assert env.now.distance.shape[1] > 0
 
@@ -148,7 +148,7 @@ def test_terms_bring_the_sensors_that_they_look_at(folder):
         ("{a: 3}", 8, "terms.a", "expected a mapping"),
     ],
 )
-def test_what_is_wrong_with_a_term_is_told_at_its_place(folder, terms, line, path, says):
+def test_errors_in_a_term_are_reported_at_their_place(folder, terms, line, path, says):
     with pytest.raises(SpecError) as caught:
         load_task(write_task(folder, more=f"terms: {terms}\n"))
     (problem,) = caught.value.problems
@@ -168,15 +168,15 @@ def test_a_term_of_the_wrong_shape_is_named(folder):
         tiny_env(folder, more='terms: {odd: {term: "own.py:Wrong", weight: 1}}\n').step(torch.zeros(4, 2))
 
 
-def test_a_term_does_not_replace_one_of_the_tasks_own(folder):
+def test_a_term_cannot_replace_one_of_the_task(folder):
     with pytest.raises(SimulationError, match='has a term "nothing" already'):
         tiny_env(folder, task="own.py:Idle", more="terms: {nothing: {term: work, weight: 1}}\n").step(torch.zeros(4, 2))
     with pytest.raises(SimulationError, match='group "goal"'):
         tiny_env(folder, more="terms: {goal: {term: object_state}}\n")
 
 
-def test_a_document_leaves_out_a_term_of_the_task(folder):
-    """Its name is free then, and the others are as they were."""
+def test_a_document_can_remove_a_term_of_the_task(folder):
+    """Its name becomes free, and the other terms stay the same."""
     env, plain = tiny_env(folder, overrides={"rewards.near": "null"}), tiny_env(folder)
     made, other = env.step(torch.full((4, 2), 0.3)), plain.step(torch.full((4, 2), 0.3))
     assert made.info.terms.keys() == other.info.terms.keys() - {"near"}
@@ -187,8 +187,8 @@ def test_a_document_leaves_out_a_term_of_the_task(folder):
     np.testing.assert_allclose(made.info.terms["near"], 2 * env.control_step * rate, rtol=1e-6)
 
 
-def test_a_task_of_ones_own_lists_its_terms(folder):
-    """Weights are keys of its document, after those of the task that it is made from."""
+def test_a_user_defined_task_lists_its_terms(folder):
+    """Its weights are keys of the document, after those of its base task."""
     (folder / "lift.py").write_text(
         "from tgdsl.rl.task import reward_term\n"
         "from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\n\n"
@@ -201,31 +201,31 @@ def test_a_task_of_ones_own_lists_its_terms(folder):
     env = tiny_env(folder, task="lift.py:Lift", overrides={"rewards.height": -2})
     assert list(env.task.terms)[-1] == "height" and len(env.task.terms) == len(InPalmRotate.terms) + 1
     assert env.task.Rewards.model_fields["height"].description == "Height of the object [1/(m s)]."
-    made = env.step(torch.zeros(4, 2))
+    result = env.step(torch.zeros(4, 2))
     expected = -2 * env.control_step * env.now.object.pos[:, 2].numpy()
-    np.testing.assert_allclose(made.info.terms["height"], expected, rtol=1e-6)
+    np.testing.assert_allclose(result.info.terms["height"], expected, rtol=1e-6)
 
 
 def test_only_the_nearest_probes_count(folder):
     env = tiny_env(folder, more="rewards: {near: null}\nterms: {near: {weight: 2, width: 1 cm, nearest: 3}}\n")
-    made = env.step(torch.full((4, 2), 0.3))
+    result = env.step(torch.full((4, 2), 0.3))
     nearest = np.sort(np.maximum(env.now.distance.numpy(), 0.0), axis=1)[:, :3]
     expected = 2 * env.control_step * np.exp(-nearest / 0.01).mean(axis=1)
-    np.testing.assert_allclose(made.info.terms["near"], expected, rtol=1e-6)
+    np.testing.assert_allclose(result.info.terms["near"], expected, rtol=1e-6)
 
 
-def test_the_net_force_is_that_of_mujocos_contacts(folder):
-    """Both plates and the floor press: with one physics step, forces are of where the control step began."""
+def test_the_net_force_sums_mujocos_contacts(folder):
+    """Both plates and the floor press. With one physics step, forces are those at the start of the control step."""
     more = "randomise: {xy: [20 mm, 20 mm]}\nphysics: {substeps: 1}\naction: {mode: absolute}\n"
     more += "terms: {free: {term: net_force, weight: 1, free: 1 mN, most: 1000 N}, bounded: {term: net_force, weight: 1, free: 1 N, most: 2 N}}\n"
     env, names = tiny_env(folder, 1, more=more), ("qpos", "qvel", "qacc_warmstart", "ctrl")
-    model, seen = env.sim.env_model(0), []
+    model, sizes = env.sim.env_model(0), []
     for _ in range(120):
-        before = {name: env.sim.arrays[name][0].clone().numpy() for name in names}
-        made = env.step(torch.tensor([[0.0, -1.0]]))
-        before["ctrl"] = env.sim.arrays["ctrl"][0].numpy()
+        state = {name: env.sim.arrays[name][0].clone().numpy() for name in names}
+        result = env.step(torch.tensor([[0.0, -1.0]]))
+        state["ctrl"] = env.sim.arrays["ctrl"][0].numpy()
         data = mujoco.MjData(model)
-        for name, value in before.items():
+        for name, value in state.items():
             getattr(data, name)[:] = value
         mujoco.mj_forward(model, data)
         net, force, hand = np.zeros(3), np.zeros(6), [model.body(name).id for name in ("left", "right")]
@@ -235,10 +235,10 @@ def test_the_net_force_is_that_of_mujocos_contacts(folder):
             if set(bodies) & set(hand) and model.body("ball").id in bodies:
                 net += (1 if bodies[0] in hand else -1) * data.contact[i].frame.reshape(3, 3).T @ force[:3]
         size = np.linalg.norm(net)
-        found = [float(made.info.terms[name]) / env.control_step for name in ("free", "bounded")]
-        np.testing.assert_allclose(found, [max(0, size - 1e-3), min(2, max(0, size - 1))], atol=1e-5)
-        seen.append(size)
-    assert max(seen) > 3 and any(1 < size < 3 for size in seen)
+        rates = [float(result.info.terms[name]) / env.control_step for name in ("free", "bounded")]
+        np.testing.assert_allclose(rates, [max(0, size - 1e-3), min(2, max(0, size - 1))], atol=1e-5)
+        sizes.append(size)
+    assert max(sizes) > 3 and any(1 < size < 3 for size in sizes)
 
 
 def test_an_episode_ends_at_a_score(folder):
@@ -246,13 +246,13 @@ def test_an_episode_ends_at_a_score(folder):
     ends = []
     for _ in range(60):
         env.sim.qvel[:, 8] = torch.tensor([0.0, 6.0, 3.0])  # spun by hand
-        made = env.step(torch.zeros(3, 2))
-        ends += [(made.terminated.tolist(), made.info.score.tolist())] if made.terminated.any() else []
+        result = env.step(torch.zeros(3, 2))
+        ends += [(result.terminated.tolist(), result.info.score.tolist())] if result.terminated.any() else []
     assert next(end for end, _ in ends) == [False, True, False] and ends[0][1][1] == 2
     assert not any(end[0] for end, _ in ends) and any(end[2] for end, _ in ends)
 
 
-def test_a_group_of_forces_is_of_links_that_a_document_names(folder):
+def test_a_document_chooses_the_links_of_a_group_of_forces(folder):
     env = tiny_env(folder, more='terms: {tip: {term: link_force, links: ["ri*"]}}\n')
     obs = env.step(torch.ones(4, 2)).obs["tip"]
     assert torch.equal(obs, env.now.link_force[:, 1].float())
@@ -263,7 +263,7 @@ def test_a_group_of_forces_is_of_links_that_a_document_names(folder):
 
 
 def test_parameters_of_shared_terms_are_keys_of_the_document():
-    """With the term's unit and default, unless the spec has the key."""
+    """They have the term's unit and default, unless the spec defines the key."""
 
     class OwnSpec(TaskSpec):
         max_force: float = 3.0
@@ -281,8 +281,8 @@ def test_parameters_of_shared_terms_are_keys_of_the_document():
         Reach.Spec.model_validate(common | {"reach": "-5 mm"})
 
 
-def test_a_term_of_all_tasks_stands_once():
-    """Terms of `HandTask` are in the reward of each task and in its document, after the task's own unless it repeats them."""
+def test_shared_terms_appear_once_in_each_task():
+    """Terms of `HandTask` are in each task's reward and document, after the task's own terms unless it redefines them."""
     for module, name in TASKS.values():
         task = getattr(import_module(module), name)
         assert HandTask.terms.keys() <= task.terms.keys() == task.Spec.model_fields["rewards"].annotation.model_fields.keys()

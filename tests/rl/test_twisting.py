@@ -1,4 +1,4 @@
-"""Contacts of the tasks' objects with the hand resist twisting."""
+"""Contacts between the tasks' objects and the hand resist twisting."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ LIMITS = {
     "screwdriver": ("screwdriver", 0.002),
     "grip_force": ("item", 0.005),
 }
-"""Of each task the object, and its torsional friction: the largest torque over the normal force [m]."""
+"""For each task: the object and its torsional friction, the largest torque over the normal force [m]."""
 
 pytestmark = pytest.mark.slow
 
@@ -28,9 +28,9 @@ def test_every_variant_of_an_object_resists_twisting(task):
     sensed = compile_sensed(loaded, "cpu")
     scene = sensed.touch.plan.scene
     models = SceneModels(scene, loaded.spec.physics.options)
-    (own,) = [found for found in scene.objects if found.name == name]
-    for number in range(len(own.variants)):
-        model = models.model({name: Choice(number)})
+    (scene_object,) = [candidate for candidate in scene.objects if candidate.name == name]
+    for variant in range(len(scene_object.variants)):
+        model = models.model({name: Choice(variant)})
         geoms = [i for i in range(model.ngeom) if model.body(int(model.geom_bodyid[i])).name == sensed.object]
         colliding = [i for i in geoms if model.geom_contype[i] or model.geom_conaffinity[i]]
         assert colliding

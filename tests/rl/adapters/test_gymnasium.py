@@ -148,9 +148,9 @@ def test_what_was_handed_out_stays_as_it_was(touch_env, actions):
     given, _ = env.reset(seed=3)
     before = {name: value.copy() for name, value in given.items()}
     for action in actions:
-        made = env.step(action)
+        result = env.step(action)
         same(given, before)
-        given, before = made[0], {name: value.copy() for name, value in made[0].items()}
+        given, before = result[0], {name: value.copy() for name, value in result[0].items()}
 
 
 def test_tensors_are_the_same_numbers(touch_env, actions):
@@ -161,10 +161,10 @@ def test_tensors_are_the_same_numbers(touch_env, actions):
     first, info = tensors.reset(seed=7)
     assert info == {} and all(isinstance(value, torch.Tensor) for value in first.values())
     for action, (obs, reward, terminated, truncated, told) in zip(actions, expected, strict=True):
-        made = tensors.step(torch.from_numpy(action))
-        same({name: value.numpy() for name, value in made[0].items()}, obs)
-        same(tuple(value.numpy() for value in made[1:4]), (reward, terminated, truncated))
-        ended, info = terminated | truncated, made[4]
+        result = tensors.step(torch.from_numpy(action))
+        same({name: value.numpy() for name, value in result[0].items()}, obs)
+        same(tuple(value.numpy() for value in result[1:4]), (reward, terminated, truncated))
+        ended, info = terminated | truncated, result[4]
         same(info["_final_obs"].numpy(), ended)
         same(info["_score"].numpy(), ~ended)
         assert set(info) == {

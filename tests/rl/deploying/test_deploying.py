@@ -1,4 +1,4 @@
-"""A policy on a simulation, an emulated hand and a log: what it sees and asks for is what TouchEnv's would."""
+"""A policy on a simulation, an emulated hand and a log: observations and targets equal those of TouchEnv."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 EPISODES = 3
 LOCKSTEP = {"lockstep": True, "calibration": CALIBRATION}
 CLOSE = {"rtol": 1e-5, "atol": 2e-6}
-"""float32, products of one row and of several."""
+"""float32: products of one row and of several round differently."""
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def task(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def policy(task):
-    """Linear in all that it sees, with velocities as a hand measures them."""
+    """Return a linear policy of all its observations, with velocities measured as on a hand."""
     return press_policy(task.parent, task, joint_vel="measured")
 
 
@@ -39,46 +39,46 @@ def blind(task):
     return press_policy(task.parent, task, Blind(6), "blind.pt", joint_vel="measured")
 
 
-def in_environments(task, file, **overrides):
-    """Return observations and targets of each step of the first episodes of environments, (step, env, …), and scores."""
+def run_in_environments(task, file, **overrides):
+    """Return (observations, target) of each step of the environments' first episodes, and their scores."""
     env = TouchEnv(task, EPISODES, threads=1, overrides=overrides)
     policy, obs, steps = policy_for(env, read_policy(file)), env.reset(SEED), []
     for _ in range(env.max_steps):
-        made = env.step(policy(obs))
-        target = env.actuation.target.clone() if not made.info.ended.any() else None  # the next episode's
+        result = env.step(policy(obs))
+        target = env.actuation.target.clone() if not result.info.ended.any() else None  # would be the next episode's
         steps.append((obs, target))
-        obs = made.obs
+        obs = result.obs
     env.close()
-    return steps, made.info.score
+    return steps, result.info.score
 
 
 @pytest.mark.parametrize(("joint_vel", "scale"), [("measured", 1.0), ("exact", 0.2)])
-def test_on_a_simulation_it_does_what_it_does_in_environments(task, joint_vel, scale):
-    """Episode i is that of environment i: observations, targets and scores; drives with play, bias and delay are the scene's."""
+def test_deployment_in_simulation_equals_environments(task, joint_vel, scale):
+    """Episode i equals environment i: observations, targets and scores, with play, bias and delay of the drives."""
     overrides = {"joint_vel": joint_vel, "proprio.vel_scale": scale}
     file = press_policy(task.parent, task, name=f"{joint_vel}_{scale}.pt", **overrides)
-    expected, scores = in_environments(task, file, **overrides)
-    found = list(Deployment(task, file).steps(EPISODES))
-    assert len(found) == EPISODES * len(expected)
-    for moment in found:
+    expected, scores = run_in_environments(task, file, **overrides)
+    moments = list(Deployment(task, file).steps(EPISODES))
+    assert len(moments) == EPISODES * len(expected)
+    for moment in moments:
         obs, target = expected[moment.index]
         assert list(moment.obs) == ["proprio", "tactile_sensors", "goal"]
         for name, value in moment.obs.items():
             torch.testing.assert_close(value[0], obs[name][moment.episode], **CLOSE)
         if target is not None:
             torch.testing.assert_close(moment.target[0], target[moment.episode], rtol=0, atol=1e-6)
-    last = [moment.step for moment in found if moment.index == len(expected) - 1]
-    assert all(own.truncated for own in last) and not any(m.step.info.ended for m in found if m.index < 20)
-    np.testing.assert_allclose([own.info.score for own in last], scores[:, None], atol=1e-5)
-    assert max(moment.obs["tactile_sensors"].abs().max() for moment in found) > 10
+    last = [moment.step for moment in moments if moment.index == len(expected) - 1]
+    assert all(step.truncated for step in last) and not any(m.step.info.ended for m in moments if m.index < 20)
+    np.testing.assert_allclose([step.info.score for step in last], scores[:, None], atol=1e-5)
+    assert max(moment.obs["tactile_sensors"].abs().max() for moment in moments) > 10
 
 
-def test_set_points_from_elsewhere_move_environments_as_actions_do(task):
-    """To the bit, with the targets that actions gave."""
+def test_following_set_points_equals_stepping_with_actions(task):
+    """Equal to the bit when the set-points are the actions' targets."""
     generator, runs, targets = torch.Generator().manual_seed(0), [], []
     actions = [2 * torch.rand((2, 6), generator=generator) - 1 for _ in range(12)]
     for follows in (False, True):
-        env, found = TouchEnv(task, 2, threads=1), []
+        env, states = TouchEnv(task, 2, threads=1), []
         for i, action in enumerate(actions):
             if follows:
                 control = env.sim.ctrl.clone()
@@ -87,16 +87,16 @@ def test_set_points_from_elsewhere_move_environments_as_actions_do(task):
             else:
                 made = env.step(action)
                 targets.append(env.actuation.target.clone())
-            found.append((env.sim.qpos.clone(), made.obs["tactile_sensors"].clone(), made.info.score.clone()))
-        runs.append(found)
+            states.append((env.sim.qpos.clone(), made.obs["tactile_sensors"].clone(), made.info.score.clone()))
+        runs.append(states)
         env.close()
-    for own, other in zip(*runs, strict=True):
-        assert all(torch.equal(a, b) for a, b in zip(own, other, strict=True))
+    for state, other_state in zip(*runs, strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(state, other_state, strict=True))
     assert runs[0][0][0].abs().max() > 0
 
 
-def test_an_emulated_hand_shows_what_the_simulation_does(task, blind):
-    """Forces to half a count, angles as far as the wire's floats can say them, velocities as these make them."""
+def test_an_emulated_hand_reports_the_simulations_state(task, blind):
+    """Forces to half a count, angles to the wire's float precision, velocities accordingly."""
     runs = [list(Deployment(task, blind, source, **options).steps(2)) for source, options in SOURCES.items()]
     half_count = 0.5 * np.abs(SCALE * TURN).sum(axis=1).max()
     for simulated, emulated in zip(*runs, strict=True):
@@ -117,8 +117,8 @@ SOURCES = {"simulation": {}, "emulator": LOCKSTEP}
 
 
 @pytest.mark.slow
-def test_the_emulators_score_is_that_of_the_simulation(task, policy):
-    """A policy that acts on what it feels: within the interval of as many episodes in environments."""
+def test_scores_on_the_emulator_agree_with_the_simulation(task, policy):
+    """For a policy that uses touch: within the interval of as many episodes in environments."""
     env = TouchEnv(task, EPISODES, threads=1, overrides={"joint_vel": "measured"})
     expected = evaluate(env, policy_for(env, read_policy(policy)), EPISODES)
     env.close()
@@ -133,25 +133,25 @@ def test_the_emulators_score_is_that_of_the_simulation(task, policy):
 @pytest.mark.slow
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_contact_bits_are_forces_beyond_the_threshold(tmp_path, side):
-    """The emulated hand feels forces that the policy does not see."""
+    """The emulated hand reads forces that this policy does not observe."""
     task = press_task(tmp_path, side)
     file = press_policy(tmp_path, task, Blind(6), touch="agg_bool")
     bits = list(Deployment(task, file, "emulator", **LOCKSTEP).steps())
     file = press_policy(tmp_path, task, Blind(6), "force.pt")
     forces = list(Deployment(task, file, "emulator", **LOCKSTEP).steps())
-    for own, other in zip(bits, forces, strict=True):
-        norm = other.obs["tactile_sensors"].reshape(3, 5).norm(dim=0)
-        assert own.obs["tactile_sensors"].tolist() == [(norm > CALIBRATION.contact_threshold).float().tolist()]
-    assert 0 < own.obs["tactile_sensors"].sum() < 5
+    for bit, force in zip(bits, forces, strict=True):
+        norm = force.obs["tactile_sensors"].reshape(3, 5).norm(dim=0)
+        assert bit.obs["tactile_sensors"].tolist() == [(norm > CALIBRATION.contact_threshold).float().tolist()]
+    assert 0 < bit.obs["tactile_sensors"].sum() < 5
 
 
-def test_a_log_is_acted_on_and_moves_nothing(task, policy, tmp_path):
-    """Its angles in the order of actions, its speeds, its forces; targets follow from the first angles."""
+def test_a_log_is_replayed_without_motion(task, policy, tmp_path):
+    """Angles are in the order of actions, speeds and forces follow; targets start from the first angles."""
     readings = random_readings(1.0 + 0.02 * np.arange(20))
     log = write_log(tmp_path / "a.npz", readings)
-    found = Deployment(task, policy, str(log), goal=(1.0,), lockstep=True, calibration=CALIBRATION)
-    moments = list(found.steps())
-    names = found.prepared.moved.names
+    deployment = Deployment(task, policy, str(log), goal=(1.0,), lockstep=True, calibration=CALIBRATION)
+    moments = list(deployment.steps())
+    names = deployment.prepared.moved.names
     ids = [JOINTS.index(name.removeprefix("right_hand_")) for name in names]
     assert [f"right_hand_{name}" for name in ORDER if f"right_hand_{name}" in names] == list(names) and len(names) == 6
     speeds, target = VelocityFilter(0.02), np.clip(readings[0].state.position[ids].astype(np.float64), -1, 1)
@@ -163,66 +163,66 @@ def test_a_log_is_acted_on_and_moves_nothing(task, policy, tmp_path):
         np.testing.assert_allclose(proprio[6:12], speed[ids], rtol=1e-5)
         force = CALIBRATION.apply(reading.state.total_force)
         np.testing.assert_allclose(moment.obs["tactile_sensors"].reshape(3, 5), force.T[::-1], rtol=1e-6)
-        wanted = np.clip(target + 0.05 * np.clip(moment.action[0].numpy(), -1, 1), -1, 1)
-        target = 0.8 * wanted + 0.2 * target
+        unsmoothed = np.clip(target + 0.05 * np.clip(moment.action[0].numpy(), -1, 1), -1, 1)
+        target = 0.8 * unsmoothed + 0.2 * target
         np.testing.assert_allclose(moment.target[0], target, atol=1e-9)
         assert moment.step.info.score.isnan() and moment.obs["goal"].tolist() == [[1.0]]
-    report = found.report()
+    report = deployment.report()
     assert report.scores is None and not report.moves and report.age.median > 0
     assert str(report).startswith(f"no score: {log} has no scene that knows what happened; 1 episode, {len(moments)} control")
     assert str(report).endswith(f"{log} was not moved: actions were computed, and went nowhere")
-    again = list(found.steps(episodes=3))
-    assert [moment.episode for moment in again] == [0] * len(moments)  # no more of it is left
-    parts = list(found.steps(episodes=9, seconds=0.1))
+    repeated = list(deployment.steps(episodes=3))
+    assert [moment.episode for moment in repeated] == [0] * len(moments)  # the log has only one episode
+    parts = list(deployment.steps(episodes=9, seconds=0.1))
     assert len(parts) >= len(moments) - 5 and max(moment.episode for moment in parts) >= 2
 
 
-def test_an_episode_that_was_cut_has_no_score_though_there_is_a_scene(task, blind):
-    found = Deployment(task, blind, goal=(1.0,))
-    steps = found.steps()
+def test_an_unfinished_episode_has_no_score(task, blind):
+    deployment = Deployment(task, blind, goal=(1.0,))
+    steps = deployment.steps()
     for _ in range(3):
         next(steps)
     steps.close()
-    assert str(found.report()).startswith("no score: no episode has ended; 0 episodes, 3 control steps")
+    assert str(deployment.report()).startswith("no score: no episode has ended; 0 episodes, 3 control steps")
 
 
-def test_in_real_time_samples_have_an_age(task, blind):
-    """However busy the machine is: latency is age and inference, and no score is lost."""
-    found = Deployment(task, blind, "emulator", calibration=CALIBRATION)
-    moments = list(found.steps(seconds=0.1))
-    report = found.report()
+def test_samples_have_an_age_in_real_time(task, blind):
+    """On a busy machine too: latency is age plus inference, and every score is kept."""
+    deployment = Deployment(task, blind, "emulator", calibration=CALIBRATION)
+    moments = list(deployment.steps(seconds=0.1))
+    report = deployment.report()
     assert len(moments) == report.steps == 5 and all(moment.age_s > 0 for moment in moments)
-    both = [moment.age_s + moment.inference_s for moment in moments]
-    assert report.latency.median == pytest.approx(1e3 * np.median(both))
-    assert report.latency.p99 == pytest.approx(1e3 * np.quantile(both, 0.99))
+    latencies = [moment.age_s + moment.inference_s for moment in moments]
+    assert report.latency.median == pytest.approx(1e3 * np.median(latencies))
+    assert report.latency.p99 == pytest.approx(1e3 * np.quantile(latencies, 0.99))
     assert report.control_rate == pytest.approx(50) and report.rate > 0 and len(report.scores.each) == 1
 
 
 @pytest.mark.parametrize("goal", [(), (0.7,)])
-def test_what_is_asked_for_is_the_tasks_or_the_users(task, blind, goal):
-    found = {moment.obs["goal"].item() for moment in Deployment(task, blind, goal=goal).steps(2, 0.1)}
+def test_goals_come_from_the_task_or_the_user(task, blind, goal):
+    goals = {moment.obs["goal"].item() for moment in Deployment(task, blind, goal=goal).steps(2, 0.1)}
     if goal:
-        assert found == {np.float32(0.7)}
+        assert goals == {np.float32(0.7)}
     else:
-        assert len(found) == 2 and all(0.5 <= value <= 1.5 for value in found)
+        assert len(goals) == 2 and all(0.5 <= value <= 1.5 for value in goals)
 
 
-def test_a_policy_without_a_card(task, tmp_path):
-    """It is taken for the document's own, and its groups are those that hands have."""
+def test_a_policy_without_a_card_is_deployed(task, tmp_path):
+    """It is assumed to fit the document, and its groups are those of a hand."""
     sizes = 18 + 15 + 1
     torch.jit.trace(torch.nn.Linear(sizes, 6), torch.zeros(1, sizes)).save(str(tmp_path / "plain.pt"))
-    found = Deployment(task, tmp_path / "plain.pt", goal=(1.0,))
-    assert found.prepared.groups == {"proprio": 18, "tactile_sensors": 15, "goal": 1}
-    assert len(list(found.steps(seconds=0.1))) == 5
+    deployment = Deployment(task, tmp_path / "plain.pt", goal=(1.0,))
+    assert deployment.prepared.groups == {"proprio": 18, "tactile_sensors": 15, "goal": 1}
+    assert len(list(deployment.steps(seconds=0.1))) == 5
 
 
 @pytest.mark.slow
-def test_mujoco_warp_too(task, blind):
-    """On a CPU, in float32: the first steps, before the drives' noise and contacts part them."""
+def test_deployment_on_mujoco_warp(task, blind):
+    """On a CPU in float32: only the first steps, before noise and contacts diverge."""
     simulated, warp = (list(Deployment(task, blind, source).steps(seconds=0.2)) for source in ("simulation", "warp:cpu"))
-    for own, other in zip(simulated, warp, strict=True):
-        torch.testing.assert_close(own.obs["proprio"][:, :6], other.obs["proprio"][:, :6], rtol=0, atol=2e-3)
-        assert torch.equal(own.action, other.action)
+    for moment, other in zip(simulated, warp, strict=True):
+        torch.testing.assert_close(moment.obs["proprio"][:, :6], other.obs["proprio"][:, :6], rtol=0, atol=2e-3)
+        assert torch.equal(moment.action, other.action)
 
 
 REPOSITORY = Path(__file__).parents[3]
@@ -230,16 +230,16 @@ KEPT = REPOSITORY / "policies" / "grip_force_agg_force.pt"
 
 
 @pytest.mark.slow
-def test_the_kept_student_grips_alike_in_simulation_and_behind_the_line():
-    """Four episodes of three seconds, of another object each; scores within the interval of the simulation's."""
+def test_the_kept_student_scores_the_same_in_simulation_and_emulation():
+    """Four episodes of three seconds, each with another object; within the simulation's interval."""
     task, calibration = REPOSITORY / "examples/tasks/grip_force.yaml", REPOSITORY / "examples/tasks/grip_calibration.yaml"
-    short = {"episodes": 4, "overrides": {"episode": "3 s"}}
-    simulated = deploy(task, KEPT, **short).scores
-    emulated = deploy(task, KEPT, "emulator", lockstep=True, calibration=calibration, **short).scores
+    options = {"episodes": 4, "overrides": {"episode": "3 s"}}
+    simulated = deploy(task, KEPT, **options).scores
+    emulated = deploy(task, KEPT, "emulator", lockstep=True, calibration=calibration, **options).scores
     assert simulated.interval[0] < emulated.mean < simulated.interval[1]
 
 
-def test_a_calibration_with_another_threshold_gives_other_bits(tmp_path):
+def test_the_threshold_of_the_calibration_sets_contact_bits(tmp_path):
     task = press_task(tmp_path)
     file = press_policy(tmp_path, task, Blind(6), touch="agg_bool")
     deaf = replace(CALIBRATION, contact_threshold=1e6)

@@ -1,4 +1,4 @@
-"""grip_force with a command of the user's, and as one environment of many."""
+"""grip_force with the user's command, and as one environment of several."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,12 +14,12 @@ from tgdsl.rl.tasks.grip_force import GripForce
 
 DOCUMENT = Path(__file__).parents[3] / "examples" / "tasks" / "grip_force.yaml"
 PLAIN = {"touch": "none", "randomise.drive": {}, "randomise.push": {}}
-"""Ideal drives, and no pushes."""
+"""Ideal drives and no pushes."""
 
 
 @pytest.mark.slow
-def test_a_force_of_ones_own_is_commanded_throughout():
-    """Whatever the object weighs; beyond the document's forces it is refused."""
+def test_the_users_force_is_commanded_throughout():
+    """It does not depend on the object's weight; forces outside the document's range are refused."""
     loaded = load_task(DOCUMENT, PLAIN)
     env = TouchEnv(replace(loaded, spec=GripForce.asked_for(loaded.spec, (3.5,))), 8, threads=1)
     for _ in range(2):
@@ -31,16 +31,16 @@ def test_a_force_of_ones_own_is_commanded_throughout():
 
 
 @pytest.mark.slow
-def test_the_number_of_an_environment_says_its_object():
-    """The fourth of eight environments is what it is alone: object, command and start."""
+def test_an_environments_number_determines_its_object():
+    """The fourth of eight environments equals the same one alone: object, command and start."""
     together = TouchEnv(DOCUMENT, 8, threads=1, overrides=PLAIN)
     alone = TouchEnv(DOCUMENT, 1, threads=1, overrides=PLAIN, first_env=3)
     assert alone.task.setup.variant.tolist() == [3]
     assert torch.equal(alone.task.command[0], together.task.command[3])
     assert torch.equal(alone.sim.qpos[0], together.sim.qpos[3])
-    own, same, other = (env.sim.env_model(i) for env, i in ((alone, 0), (together, 3), (together, 0)))
+    model, same, other = (env.sim.env_model(i) for env, i in ((alone, 0), (together, 3), (together, 0)))
     for name in ("geom_size", "geom_type", "geom_contype"):
-        np.testing.assert_array_equal(getattr(own, name), getattr(same, name))
-    assert (own.geom_size != other.geom_size).any() or (own.geom_contype != other.geom_contype).any()
+        np.testing.assert_array_equal(getattr(model, name), getattr(same, name))
+    assert (model.geom_size != other.geom_size).any() or (model.geom_contype != other.geom_contype).any()
     alone.close()
     together.close()

@@ -1,4 +1,4 @@
-"""What is refused before anything is connected, and by which name."""
+"""Errors that are reported before anything is connected."""
 
 import pytest
 import torch
@@ -48,12 +48,12 @@ def policy(task):
         ),
     ],
 )
-def test_what_does_not_fit(task, policy, options, error, message):
+def test_mismatches_are_refused(task, policy, options, error, message):
     with pytest.raises(error, match=message):
         Deployment(task, policy, **options)
 
 
-def test_a_policy_of_another_task(task, policy, tmp_path):
+def test_a_policy_of_another_task_is_refused(task, policy, tmp_path):
     other = press_task(tmp_path)
     (tmp_path / "press2.py").write_text((tmp_path / "press.py").read_text())
     other.write_text(other.read_text().replace("press.py", "press2.py"))
@@ -61,7 +61,7 @@ def test_a_policy_of_another_task(task, policy, tmp_path):
         Deployment(other, policy)
 
 
-def test_a_policy_that_feels_with_other_taxels(task, policy, tmp_path):
+def test_a_policy_with_other_taxels_is_refused(task, policy, tmp_path):
     other = press_task(tmp_path)
     sensors = (tmp_path / "sensors.yaml").read_text()
     (tmp_path / "sensors.yaml").write_text(sensors.replace("0.026", "0.025"))
@@ -70,8 +70,8 @@ def test_a_policy_that_feels_with_other_taxels(task, policy, tmp_path):
 
 
 @pytest.mark.parametrize("touch", ["depth", "bool"])
-def test_what_fingertips_do_not_give(task, touch):
-    """It acts on a simulation; on a hand, emulated or real, it is refused before there is one."""
+def test_readings_that_fingertips_lack_are_refused(task, touch):
+    """Such a policy runs in simulation; on a hand, emulated or real, it is refused before connecting."""
     file = teacher(task.parent / f"{touch}.pt", load_task(task, {"touch": touch}), ["proprio", "tactile_sensors", "goal"])
     assert len(list(Deployment(task, file).steps(seconds=0.04))) == 2
     for source, options in (("emulator", {"lockstep": True}), (PORT, {"goal": (1.0,)})):
@@ -86,8 +86,8 @@ def test_contact_bits_need_a_threshold(task):
 
 
 @pytest.mark.parametrize("source", [PORT, "emulator"])
-def test_a_rate_beyond_the_lines(task, source):
-    """One exchange takes 297 + 2217 bytes of 10 bits at 3 Mbaud; in lockstep the emulator's scene waits."""
+def test_a_rate_beyond_the_lines_is_refused(task, source):
+    """An exchange takes 297 + 2217 bytes of 10 bits at 3 Mbaud; in lockstep the emulator's scene waits."""
     fast = {"physics.substeps": 2, "physics.timestep": "4 ms"}
     file = press_policy(task.parent, task, Blind(6), "fast.pt", **fast)
     with pytest.raises(
@@ -95,11 +95,11 @@ def test_a_rate_beyond_the_lines(task, source):
     ):
         next(Deployment(task, file, source, goal=(1.0,), overrides=fast, calibration=CALIBRATION).steps())
     if source == "emulator":
-        found = Deployment(task, file, source, overrides=fast, calibration=CALIBRATION, lockstep=True)
-        assert next(found.steps()).index == 0
+        deployment = Deployment(task, file, source, overrides=fast, calibration=CALIBRATION, lockstep=True)
+        assert next(deployment.steps()).index == 0
 
 
-def test_a_watchdog_that_bites_between_steps(task, policy):
+def test_control_steps_longer_than_the_watchdog_are_refused(task, policy):
     slow = {"physics.substeps": 25, "physics.timestep": "4 ms"}
     file = press_policy(task.parent, task, Blind(6), "slow.pt", **slow)
 
@@ -110,26 +110,26 @@ def test_a_watchdog_that_bites_between_steps(task, policy):
 
     with pytest.raises(MotionError, match="a control step of 100 ms, and the watchdog bites after 100 ms"):
         next(Deployment(task, file, PORT, goal=(1.0,), overrides=slow, motion=limits).steps())
-    found = Deployment(task, policy, PORT, goal=(1.0,), motion=limits)
-    assert found.moves and not Deployment(task, policy, PORT, goal=(1.0,)).moves
+    deployment = Deployment(task, policy, PORT, goal=(1.0,), motion=limits)
+    assert deployment.moves and not Deployment(task, policy, PORT, goal=(1.0,)).moves
     with pytest.raises(HandDisconnectedError, match="/dev/no-such-port cannot be opened"):
-        next(found.steps())
+        next(deployment.steps())
 
 
 @pytest.mark.parametrize("options", [{"episodes": 0}, {"seconds": 0.0}, {"seconds": float("inf")}])
-def test_nothing_to_do(task, policy, options):
+def test_empty_deployments_are_refused(task, policy, options):
     with pytest.raises(DeployError, match="expected at least 1, and more than 0 s"):
         next(Deployment(task, policy).steps(**options))
 
 
-def test_actions_that_are_no_numbers(task):
-    """Of a policy that divides by zero once its last action, the last six numbers of proprioception, was another than 0."""
+def test_actions_that_are_not_finite_are_refused(task):
+    """The policy divides by zero once its last action, columns 12 to 17 of proprioception, is not 0."""
 
-    class Lost(torch.nn.Module):
+    class Dividing(torch.nn.Module):
         def forward(self, x: torch.Tensor) -> torch.Tensor:
             return 1.0 / (x[:, 12:18] == 0).float()
 
-    moments = Deployment(task, press_policy(task.parent, task, Lost(), "lost.pt")).steps()
+    moments = Deployment(task, press_policy(task.parent, task, Dividing(), "lost.pt")).steps()
     next(moments)
     with pytest.raises(PolicyError, match=r"lost.pt: at control step 1 this policy returns .* expected finite actions"):
         next(moments)

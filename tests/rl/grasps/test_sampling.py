@@ -60,8 +60,8 @@ def test_what_was_kept_holds(tmp_path):
     begin = env.now.object.pos.clone()
     for i in range(40):
         env.sim.arrays["xfrc_applied"][:, env.sim.model.body("rod").id, :3] = 0.2 * torch.eye(3).double()[i // 10 % 3]
-        made = env.step(torch.zeros(6, 2))
-        assert not made.terminated.any()
+        result = env.step(torch.zeros(6, 2))
+        assert not result.terminated.any()
     assert ((env.now.object.pos - begin).norm(dim=1) < 0.01).all() and (env.task.tilt < 0.2).all()
     env.close()
 

@@ -136,10 +136,10 @@ def test_a_record_holds_what_happened(env, tmp_path):
         np.testing.assert_array_equal(found["qpos"][i], env.sim.qpos)
         if i % STEPS == 0:  # at the start of episodes observations are of the same instant
             np.testing.assert_allclose(found["qpos"][i][:, :2], found["obs:proprio"][i][:, :2], atol=1e-6)
-        made = env.step(torch.from_numpy(found["action"][i]))
-        obs, info = made.obs, made.info
+        result = env.step(torch.from_numpy(found["action"][i]))
+        obs, info = result.obs, result.info
         for name in ("reward", "terminated", "truncated"):
-            np.testing.assert_array_equal(found[name][i], getattr(made, name))
+            np.testing.assert_array_equal(found[name][i], getattr(result, name))
         np.testing.assert_array_equal(found["score"][i], info.score)
         assert not found["fault"][i].any()
         ended += [(i, row) for row in info.ended.nonzero()[:, 0].tolist()]

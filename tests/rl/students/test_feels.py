@@ -1,4 +1,4 @@
-"""Several things felt in one simulation: each is what an environment of its own would feel."""
+"""Several kinds of touch in one simulation: each equals that of a separate environment."""
 
 from pathlib import Path
 
@@ -20,44 +20,44 @@ ENVS = 3
 
 @pytest.fixture
 def make(tmp_path: Path):
-    made, task = [], felt_task(tmp_path)
+    envs, task = [], felt_task(tmp_path)
 
     def environment(feels=None, **overrides):
-        made.append(TouchEnv(task, ENVS, seed=3, threads=1, overrides=overrides, feels=feels))
-        return made[-1]
+        envs.append(TouchEnv(task, ENVS, seed=3, threads=1, overrides=overrides, feels=feels))
+        return envs[-1]
 
     yield environment
-    for env in made:
+    for env in envs:
         env.close()
 
 
-def rolled(env, steps=12):
-    """Return the observations of steps in which the finger swings onto the object, over an episode's end."""
-    seen = [env.reset(3)]
+def rollout(env, steps=12):
+    """Return observations while the finger swings onto the object, across the end of an episode."""
+    observations = [env.reset(3)]
     for step in range(steps):
-        seen.append(env.step(torch.full((ENVS, 2), 1.0 if step % 8 < 4 else -1.0)).obs)
-    return {name: torch.stack([obs[name] for obs in seen]) for name in seen[0]}
+        observations.append(env.step(torch.full((ENVS, 2), 1.0 if step % 8 < 4 else -1.0)).obs)
+    return {name: torch.stack([obs[name] for obs in observations]) for name in observations[0]}
 
 
 def assert_same(one, two):
-    """Up to rounding: a processor's vectors treat what is left at the end of an array by instructions of another rounding."""
+    """Compare up to rounding: vector instructions round the tail of an array differently."""
     torch.testing.assert_close(one, two, rtol=1e-5, atol=1e-6 * float(two.abs().max()))
 
 
-def test_each_group_is_what_an_environment_of_its_own_feels(make):
-    """With noise too, where no other links draw numbers before its own; and what else is seen is the same."""
+def test_each_group_equals_that_of_a_separate_environment(make):
+    """Also with noise, where no other links draw numbers first; other observations are equal too."""
     env = make(FEELS)
-    found = rolled(env)
-    assert "tactile_sensors" not in found
+    together = rollout(env)
+    assert "tactile_sensors" not in together
     for number, type_ in enumerate(TYPES):
         felt = Felt(type_, ("ends", "all")[number % 2], "clean")
-        alone = rolled(make(touch=felt.type, placement=felt.placement))
-        assert_same(found[felt.group], alone["tactile_sensors"])
+        alone = rollout(make(touch=felt.type, placement=felt.placement))
+        assert_same(together[felt.group], alone["tactile_sensors"])
         assert (alone["tactile_sensors"] != 0).any(), felt
-        assert torch.equal(found["priv_obj_state"], alone["priv_obj_state"])
-    noisy, clean = (found[Felt("depth", "all", noise).group] for noise in ("noisy", "clean"))
+        assert torch.equal(together["priv_obj_state"], alone["priv_obj_state"])
+    noisy, clean = (together[Felt("depth", "all", noise).group] for noise in ("noisy", "clean"))
     assert not torch.equal(noisy, clean)
-    alone = rolled(make(touch="depth", placement="all", noise="noisy"))
+    alone = rollout(make(touch="depth", placement="all", noise="noisy"))
     assert_same(noisy, alone["tactile_sensors"])
 
 
@@ -74,11 +74,11 @@ def test_one_sensor_serves_all_types_placements_and_noises(make):
     assert env.groups[Felt("agg_force", "ends", "noisy").group] == 3
 
 
-def test_nothing_is_felt(make):
+def test_an_empty_list_gives_no_touch(make):
     assert not [name for name in make([]).groups if name.startswith("tactile")]
 
 
-def test_mistakes_are_named(make, tmp_path):
+def test_errors_are_named(make, tmp_path):
     with pytest.raises(SpecError, match='has no sensor of kind "elastomer", expected one'):
         make([Felt("elastomer", "all", "clean")])
     with pytest.raises(SpecError, match='no link matches "palm"'):
@@ -90,20 +90,20 @@ def test_mistakes_are_named(make, tmp_path):
 
 
 @pytest.mark.parametrize("placement", ["ends", "all"])
-def test_images_of_a_network_are_those_of_the_module(make, placement):
-    """Made of the group's numbers; a link whose grid is smaller fills a corner."""
+def test_images_of_a_network_equal_the_modules(make, placement):
+    """They are built from the group's numbers; a link with a smaller grid fills a corner."""
     felt = Felt("force_torque", placement, "clean")
     env, alone = make([felt, Felt("force_torque", "all", "clean")]), make(touch="force_torque", placement=placement)
     grid = grid_of(env.felt[felt.group].layout, env.groups[felt.group], felt)
     action = torch.full((ENVS, 2), 0.3)
     for _ in range(3):
-        obs, own = env.step(action).obs, alone.step(action).obs
-    assert_same(obs[felt.group], own["tactile_sensors"])
+        obs, separate_obs = env.step(action).obs, alone.step(action).obs
+    assert_same(obs[felt.group], separate_obs["tactile_sensors"])
     assert (obs[felt.group] != 0).any()
-    found = Images(grid).images(obs[felt.group])
+    network_images = Images(grid).images(obs[felt.group])
     images, masks = alone.images()
-    assert found.shape[1] == len(images) == (1 if placement == "ends" else 2)
+    assert network_images.shape[1] == len(images) == (1 if placement == "ends" else 2)
     for link, (image, mask) in enumerate(zip(images.values(), masks.values(), strict=True)):
         rows, columns = mask.shape
-        assert torch.equal(found[:, link, :, :rows, :columns], image)
+        assert torch.equal(network_images[:, link, :, :rows, :columns], image)
         assert float(Images(grid).mask[link].sum()) == float(mask.sum())

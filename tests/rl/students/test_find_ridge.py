@@ -1,4 +1,4 @@
-"""A small real distillation: a finger that stops on a ridge by what it feels, and one that feels nothing."""
+"""A small real distillation: one student stops the finger on a ridge by touch, another has no touch."""
 
 from pathlib import Path
 
@@ -24,19 +24,19 @@ EPISODES = 32
 
 
 @pytest.mark.slow
-def test_students_that_feel_reach_their_teacher_and_others_do_not(tmp_path):
-    """The teacher always finds the ridge; a student that feels nothing does at chance, which is 1 in 12, at best."""
+def test_only_students_with_touch_reach_their_teacher(tmp_path):
+    """The teacher always finds the ridge; a student without touch succeeds at best by chance, 1 in 12."""
     loaded = load_task(TASK, CHOSEN)
-    own = Teacher(teacher(tmp_path / "teacher.pt", loaded, ["command", "tactile_sensors"], FindRidge()), loaded)
-    own.check_taxels()
+    ridge_teacher = Teacher(teacher(tmp_path / "teacher.pt", loaded, ["command", "tactile_sensors"], FindRidge()), loaded)
+    ridge_teacher.check_taxels()
     keys = student_keys(["depth", "bool", "none"], ["tips"], ["clean"], 1)
-    env = TouchEnv(loaded, 96, threads=1, feels=feels(keys, own.felt))
+    env = TouchEnv(loaded, 96, threads=1, feels=feels(keys, ridge_teacher.felt))
     try:
-        distiller = Distiller(env, loaded, own.bound(env), keys, 0)
+        distiller = Distiller(env, loaded, ridge_teacher.bound(env), keys, 0)
         for _ in range(40):
             distiller.iterate()
-        found = evaluate_each(env, distiller.acting(), len(keys), EPISODES)
+        evaluations = evaluate_each(env, distiller.acting(), len(keys), EPISODES)
     finally:
         env.close()
-    scores = {key.kind[0]: each.score for key, each in zip(distiller.keys, found, strict=True)}
+    scores = {key.kind[0]: evaluation.score for key, evaluation in zip(distiller.keys, evaluations, strict=True)}
     assert scores["depth"] >= 0.95 and scores["bool"] >= 0.6 and scores["none"] <= 0.3

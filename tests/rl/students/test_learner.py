@@ -35,7 +35,7 @@ FORWARD = 1e-5  # float32: sums in another order
 
 @pytest.fixture
 def make(tmp_path):
-    """Return a function that makes a distiller of four students: depth and bool at two placements, depth blind of the finger."""
+    """Return a function that makes a distiller of students: depth and bool at two placements, and one without touch."""
     envs, task = [], felt_task(tmp_path)
     files = {}
 
@@ -66,7 +66,7 @@ def weights(distiller):
 
 
 def test_students_of_equal_networks_are_stacked_in_blocks(make):
-    """Types of as many numbers share a stack, as do seeds; blocks cover all environments, each once."""
+    """Types of equal size share a stack, as do seeds; blocks partition the environments."""
     distiller = make(seeds=2)
     stacks = [[key.name for key in rollout.keys] for rollout in distiller.rollouts]
     assert stacks == [
@@ -80,31 +80,31 @@ def test_students_of_equal_networks_are_stacked_in_blocks(make):
     assert distiller.groups["none-s0"] == ["proprio", "goal"]
 
 
-def test_each_student_acts_by_what_it_feels_and_nothing_else(make):
-    """Other types' readings, other blocks' rows: none of them changes an action; its own do."""
+def test_actions_depend_only_on_a_students_own_observations(make):
+    """Other types' readings and other blocks' rows change no action; a student's own do."""
     distiller = make(networks__touch_kind="lstm")
     distiller.roll()
     obs = {name: torch.randn_like(value) for name, value in distiller._seen.items()}
     rows = distiller.env.num_envs // len(distiller.keys)
 
-    def actions(seen):
-        return distiller.acting()(seen).split(rows)
+    def actions(observations):
+        return distiller.acting()(observations).split(rows)
 
-    before = actions(obs)
+    old_actions = actions(obs)
     for name in distiller.groups["bool-all-clean-s0"] + ["tactile_sensors/depth/ends/clean"]:
         other = obs | {name: obs[name] + 1.0}
-        for key, one, two in zip(distiller.keys, before, actions(other), strict=True):
+        for key, one, two in zip(distiller.keys, old_actions, actions(other), strict=True):
             assert torch.equal(one, two) != (name in distiller.groups[key.name]), (key.name, name)
     for block in range(len(distiller.keys)):
         other = {name: value.clone() for name, value in obs.items()}
         for value in other.values():
             value[block * rows : (block + 1) * rows] += 1.0
-        changed = [not torch.equal(one, two) for one, two in zip(before, actions(other), strict=True)]
+        changed = [not torch.equal(one, two) for one, two in zip(old_actions, actions(other), strict=True)]
         assert changed == [index == block for index in range(len(distiller.keys))]
 
 
-def test_a_student_learns_nothing_of_others(make):
-    """Other blocks' readings and labels are changed between rollout and update: its weights are the same."""
+def test_a_students_update_does_not_depend_on_others(make):
+    """Changing other blocks' readings and labels after the rollout leaves its weights the same."""
     one, other = make(), make()
     for distiller in (one, other):
         torch.manual_seed(0)
@@ -122,16 +122,16 @@ def test_a_student_learns_nothing_of_others(make):
 
 
 def test_a_rollout_holds_inputs_actions_and_labels(make):
-    """Recorded at the environments: inputs, actions, the teacher's actions, and privileged numbers."""
+    """Compared with inputs, actions, labels and privileged numbers recorded at the environments."""
     distiller, rows = make(), []
     step = distiller.env.step
 
-    def recorded(action):
+    def recording_step(action):
         obs, numbers = distiller.env.observe(), distiller.env.task.decoded(distiller.env.now)
         rows.append((obs, action.clone(), {name: value.clone() for name, value in numbers.items()}))
         return step(action)
 
-    distiller.env.step = recorded
+    distiller.env.step = recording_step
     distiller.roll()
     distiller.roll()
     for t, (obs, action, numbers) in enumerate(rows[4:]):
@@ -142,70 +142,70 @@ def test_a_rollout_holds_inputs_actions_and_labels(make):
         for rollout in distiller.rollouts:
             for i, key in enumerate(rollout.keys):
                 block = slice(rollout.first + i * rollout.rows, rollout.first + (i + 1) * rollout.rows)
-                seen = torch.cat([obs[name][block] for name in distiller.groups[key.name]], dim=1)
-                assert torch.equal(rollout.x[t, i], seen) and torch.equal(rollout.before[t, i], action[block])
-                result = rollout.stack.student(i)(seen, rollout.memory[i])
+                inputs = torch.cat([obs[name][block] for name in distiller.groups[key.name]], dim=1)
+                assert torch.equal(rollout.x[t, i], inputs) and torch.equal(rollout.before[t, i], action[block])
+                result = rollout.stack.student(i)(inputs, rollout.memory[i])
                 torch.testing.assert_close(result.action, action[block], rtol=FORWARD, atol=FORWARD)
 
 
-def test_memory_ends_with_episodes(make):
+def test_memory_is_cleared_at_the_end_of_an_episode(make):
     """Episodes last 8 steps: a student remembers its steps since the last reset."""
     distiller = make(networks__touch_kind="convrnn", networks__kind="lstm", networks__encoder__hidden="[5]")
-    seen = []
+    records = []
     step = distiller.env.step
 
-    def recorded(action):
+    def recording_step(action):
         result = step(action)
-        seen.append(([x.clone() for x in distiller._inputs], result.info.ended.clone()))
+        records.append(([x.clone() for x in distiller._inputs], result.info.ended.clone()))
         return result
 
-    distiller.env.step = recorded
+    distiller.env.step = recording_step
     distiller.iterate()
-    held = [torch.zeros_like(rollout.memory) for rollout in distiller.rollouts]
-    seen.clear()
+    memories = [torch.zeros_like(rollout.memory) for rollout in distiller.rollouts]
+    records.clear()
     for rollout in distiller.rollouts:
         rollout.memory.zero_()
     for _ in range(3):
         distiller.roll()
-    assert any(bool(ended.any()) for _, ended in seen) and not all(bool(ended.any()) for _, ended in seen)
-    for inputs, ended in seen:
+    assert any(bool(ended.any()) for _, ended in records) and not all(bool(ended.any()) for _, ended in records)
+    for inputs, ended in records:
         for i, rollout in enumerate(distiller.rollouts):
-            held[i] = rollout.stack(inputs[i], held[i]).memory
-            held[i][rollout.split(ended)] = 0.0
-    for expected, rollout in zip(held, distiller.rollouts, strict=True):
+            memories[i] = rollout.stack(inputs[i], memories[i]).memory
+            memories[i][rollout.split(ended)] = 0.0
+    for expected, rollout in zip(memories, distiller.rollouts, strict=True):
         torch.testing.assert_close(rollout.memory, expected, rtol=FORWARD, atol=FORWARD)
 
 
 @pytest.mark.parametrize(("aggregate", "kind"), [(1, "mlp"), (3, "lstm")])
 def test_passes_take_the_latest_rollouts(make, aggregate, kind):
-    """The first pass takes the latest rollout; each other pass any of the last, with its labels and memory."""
+    """The first pass uses the latest rollout; each other pass any recent one, with its labels and memory."""
     epochs = 3 * aggregate
     options = {"types": ("depth",), "placements": ("ends",), "aggregate": aggregate, "epochs": epochs}
     distiller, rollouts, passes = make(**options, networks__touch_kind=kind), [], []
     learned = distiller._learned
 
-    def noted():
+    def snapshot():
         return [value.clone() for value in distiller._of_rollout()]
 
-    distiller._learned = lambda: (passes.append(noted()), learned())
+    distiller._learned = lambda: (passes.append(snapshot()), learned())
     for _ in range(4):
         distiller.roll()
-        rollouts.append(noted())
+        rollouts.append(snapshot())
         passes.clear()
         distiller.learn()
-        which = [[all(map(torch.equal, rollout, seen)) for rollout in rollouts].index(True) for seen in passes]
-        assert which[0] == len(rollouts) - 1 and len(which) == epochs
-        assert set(which) == set(range(max(0, len(rollouts) - aggregate), len(rollouts)))
-        assert all(map(torch.equal, noted(), rollouts[-1]))
+        indices = [[all(map(torch.equal, rollout, used)) for rollout in rollouts].index(True) for used in passes]
+        assert indices[0] == len(rollouts) - 1 and len(indices) == epochs
+        assert set(indices) == set(range(max(0, len(rollouts) - aggregate), len(rollouts)))
+        assert all(map(torch.equal, snapshot(), rollouts[-1]))
 
 
-def test_a_clip_bounds_from_where_a_pass_begins(make):
-    """In a rollout that earlier weights made too: a_0 is what the present ones ask for, and the bounded error has a gradient."""
+def test_a_clip_is_relative_to_the_weights_at_the_start_of_a_pass(make):
+    """Also for an older rollout: a_0 is the current weights' action, so the bounded error has a gradient."""
     options = {"types": ("depth", "none"), "placements": ("ends",), "networks__touch_kind": "lstm"}
-    distiller, whole, passes = make(**options, aggregate=3, epochs=4, clip=1e-3), [], []
+    distiller, actions, passes = make(**options, aggregate=3, epochs=4, clip=1e-3), [], []
     learned = distiller._learned
 
-    def noted():
+    def recording_pass():
         is_latest = all(map(torch.equal, [rollout.x for rollout in distiller.rollouts], latest))
         for rollout in distiller.rollouts:
             memory = rollout.begun
@@ -215,21 +215,21 @@ def test_a_clip_bounds_from_where_a_pass_begins(make):
                 memory = torch.where(rollout.split(distiller._ended[t])[..., None], 0.0, result.memory)
         learned()
 
-    distiller._learned = noted
+    distiller._learned = recording_pass
     for _ in range(3):
         distiller.roll()
         latest = [rollout.x.clone() for rollout in distiller.rollouts]
-        whole.append([rollout.before.clone() for rollout in distiller.rollouts])
+        actions.append([rollout.before.clone() for rollout in distiller.rollouts])
         distiller.learn()
-        assert all(map(torch.equal, [rollout.before for rollout in distiller.rollouts], whole[-1]))
+        assert all(map(torch.equal, [rollout.before for rollout in distiller.rollouts], actions[-1]))
     earlier = [is_same for is_latest, is_same in passes if not is_latest]
     assert earlier and all(earlier) and not all(is_same for is_latest, is_same in passes if is_latest)
 
 
 def test_a_distillation_resumes_to_the_bit(make, tmp_path):
-    """To the bit, where the environments are put where they were; otherwise a checkpoint begins episodes again.
+    """Exact once the environments' state is restored; a checkpoint alone restarts episodes.
 
-    A step comes first: decoders read the instant of a step, which a loaded state lacks.
+    One step comes first: decoders read the instant of a step, which a loaded state lacks.
     """
     options = {"types": ("depth", "none"), "placements": ("ends",), "networks__touch_kind": "convrnn"}
     options |= {"std": 0.1, "max_grad_norm": 0.5, "decoders": "{object_size: {scale: 20}}"}
@@ -237,10 +237,10 @@ def test_a_distillation_resumes_to_the_bit(make, tmp_path):
     for _ in range(2):
         one.iterate()
     write_checkpoint(state_of(one, 1.0), tmp_path / "checkpoint.pt")
-    envs, generator = one.env.state_dict(), torch.get_rng_state()
+    env_state, generator = one.env.state_dict(), torch.get_rng_state()
     restore(other, read_checkpoint(tmp_path / "checkpoint.pt"), tmp_path / "checkpoint.pt")
     assert (other.iteration, other.samples) == (2, 2 * 4 * 4)
-    other.env.load_state_dict(envs)
+    other.env.load_state_dict(env_state)
     for distiller in (one, other):
         distiller.env.step(torch.zeros(distiller.env.num_envs, distiller.env.num_actions))
         distiller.go_on_here()
@@ -272,7 +272,7 @@ def test_a_checkpoint_of_other_students_is_refused(make, tmp_path):
 
 
 def test_students_learn_what_they_can_see(make):
-    """A teacher that looks at joints alone, as all of them can."""
+    """The teacher uses only the joints, which all students observe."""
     options = {
         "types": ("bool", "none"),
         "placements": ("ends",),
@@ -292,18 +292,18 @@ def test_students_learn_what_they_can_see(make):
 
 
 def test_metrics_of_an_iteration_are_per_block(make):
-    """Scores are means over the episodes that ended in a student's own environments."""
+    """Scores are means over the episodes that ended in the student's own environments."""
     distiller = make()
     ended, scores, step = torch.zeros(10), torch.zeros(10), distiller.env.step
 
-    def recorded(action):
+    def recording_step(action):
         result = step(action)
         ended.add_(result.info.ended)
         result = result._replace(info=result.info._replace(score=torch.arange(10.0)))
         scores.add_(result.info.ended * result.info.score)
         return result
 
-    distiller.env.step = recorded
+    distiller.env.step = recording_step
     metrics = distiller.iterate().metrics
     for i, key in enumerate(distiller.keys):
         block = slice(2 * i, 2 * i + 2)
@@ -311,8 +311,8 @@ def test_metrics_of_an_iteration_are_per_block(make):
         assert metrics.get(f"Score/{key.name}") == (pytest.approx(float(scores[block].sum()) / count) if count else None)
 
 
-def test_blocks_are_evaluated_as_one_policy_is(make):
-    """Scores and returns of a block are those of one policy in the same environments."""
+def test_evaluating_blocks_equals_evaluating_one_policy(make):
+    """A block's scores and returns equal those of one policy in the same environments."""
     distiller = make(types=("none",), placements=("ends",), seeds=2, num_envs=6)
     each = evaluate_each(distiller.env, distiller.acting(), 2, 6, seed=5)
     assert [(block.episodes, block.envs) for block in each] == [(6, 3), (6, 3)]
@@ -322,7 +322,7 @@ def test_blocks_are_evaluated_as_one_policy_is(make):
     assert each[0].episode_return != each[1].episode_return
 
 
-def test_a_teacher_may_feel(make, tmp_path):
+def test_a_teacher_may_use_touch(make, tmp_path):
     """The environments compute the teacher's type of touch besides the students'."""
     task = tmp_path / "task.yaml"
     loaded = load_task(task, SMALL | {"touch": "depth", "placement": "all"})
@@ -345,8 +345,8 @@ def test_a_teacher_may_feel(make, tmp_path):
 def test_errors_in_the_document_are_located(make):
     with pytest.raises(SpecError, match=r'distill\.decoders\.size: the task has no privileged number "size"'):
         make(decoders="{size: {}}")
-    said = 'there is no group of observations "propio"; did you mean "proprio"?'
-    with pytest.raises(SpecError, match=r"distill\.groups\[0\]: " + re.escape(said)):
+    message = 'there is no group of observations "propio"; did you mean "proprio"?'
+    with pytest.raises(SpecError, match=r"distill\.groups\[0\]: " + re.escape(message)):
         make(groups="[propio]")
     with pytest.raises(SpecError, match="steps is 5, expected a multiple of gradient_length, 2"):
         make(steps=5)

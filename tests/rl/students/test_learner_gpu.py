@@ -1,4 +1,4 @@
-"""Students on a GPU: captured, and side by side on streams of their own, they learn what they learn in turn."""
+"""Students on a GPU learn the same, captured on parallel streams, as one after another."""
 
 import pytest
 import torch
@@ -30,56 +30,56 @@ SMALL = {
 
 @pytest.fixture(params=["mlp", "convrnn"])
 def distillers(request, tmp_path):
-    """Return two distillers of stacks of several sizes: one as it is, one that captures nothing and works in turn."""
+    """Return two distillers with stacks of several sizes: one captured and parallel, one eager and sequential."""
     loaded = load_task(felt_task(tmp_path), SMALL | {"distill.networks.touch_kind": request.param})
     file = teacher(tmp_path / "teacher.pt", loaded, ("priv_proprio", "priv_obj_state"), std=[0.5, 0.25])
-    keys, own = student_keys(["depth", "bool", "none"], ["ends", "all"], ["clean"], 2), Teacher(file, loaded)
-    made = []
+    keys, student_teacher = student_keys(["depth", "bool", "none"], ["ends", "all"], ["clean"], 2), Teacher(file, loaded)
+    pair = []
     for _ in range(2):
-        env = TouchEnv(loaded, 4 * len(keys), seed=1, device="cuda", feels=feels(keys, own.felt))
-        made.append(Distiller(env, loaded, own.bound(env), keys, 0))
-    for part in vars(made[1]).values():
+        env = TouchEnv(loaded, 4 * len(keys), seed=1, device="cuda", feels=feels(keys, student_teacher.felt))
+        pair.append(Distiller(env, loaded, student_teacher.bound(env), keys, 0))
+    for part in vars(pair[1]).values():
         if isinstance(part, Captured):
             part._is_captured = False
-    made[1]._beside = SideBySide(0, "cpu")
-    yield made
-    for distiller in made:
+    pair[1]._beside = SideBySide(0, "cpu")
+    yield pair
+    for distiller in pair:
         distiller.env.close()
 
 
 def test_streams_and_graphs_change_nothing(distillers):
-    """Five updates from the same rollouts, at smaller and smaller rates: two eager ones, then graphs."""
-    found, other = distillers
-    assert len(found.rollouts) == 3
+    """Five updates from the same rollouts at falling rates: two eager ones, then graphs."""
+    captured, eager = distillers
+    assert len(captured.rollouts) == 3
     for number in range(5):
         for distiller in distillers:
             distiller.set_rate(number / 5)
-        found.roll()
-        other.go_on()
-        for value, its in zip(other._of_rollout(), found._of_rollout(), strict=True):
+        captured.roll()
+        eager.go_on()
+        for value, its in zip(eager._of_rollout(), captured._of_rollout(), strict=True):
             value.copy_(its)
         for distiller in distillers:
             distiller.learn()
-        torch.testing.assert_close(found._losses, other._losses, rtol=1e-4, atol=1e-6)
-        for own, its in zip(found.rollouts, other.rollouts, strict=True):
+        torch.testing.assert_close(captured._losses, eager._losses, rtol=1e-4, atol=1e-6)
+        for own, its in zip(captured.rollouts, eager.rollouts, strict=True):
             for name, value in own.stack.parameters.items():
                 torch.testing.assert_close(value, its.stack.parameters[name], rtol=1e-3, atol=1e-4)
             for name, value in own.stack.moments.items():
                 torch.testing.assert_close(value, its.stack.moments[name], rtol=1e-9, atol=1e-12)
-    assert found._learned._graph is not None and other._learned._graph is None
+    assert captured._learned._graph is not None and eager._learned._graph is None
 
 
-def test_the_host_waits_for_nothing(distillers):
-    found, _ = distillers
+def test_the_host_never_waits(distillers):
+    distiller, _ = distillers
     for _ in range(3):
-        found.iterate()
+        distiller.iterate()
     torch.cuda.synchronize()
     torch.cuda.set_sync_debug_mode("error")
     try:
         for share in (0.4, 0.8):
-            found.set_rate(share)
-            found.roll()
-            found.learn()
+            distiller.set_rate(share)
+            distiller.roll()
+            distiller.learn()
     finally:
         torch.cuda.set_sync_debug_mode("default")
-    assert all(torch.isfinite(torch.tensor(list(found.iterate().metrics.values()))))
+    assert all(torch.isfinite(torch.tensor(list(distiller.iterate().metrics.values()))))

@@ -1,4 +1,4 @@
-"""An update of a stack against students that are trained one by one in plain torch, in float64."""
+"""An update of a stack, against students trained one by one in plain torch, in float64."""
 
 import math
 import random
@@ -32,7 +32,7 @@ KINDS = {
 
 
 class Chosen(NamedTuple):
-    """What of `distill:` differs between the cases."""
+    """Settings of `distill:` that differ between the cases."""
 
     loss: str = "mse"
     clip: float | None = None
@@ -51,7 +51,7 @@ CHOSEN = {
 
 
 class Lesson(NamedTuple):
-    """A rollout of one student: (step, row, …), but for `begun`, (row, memory)."""
+    """A rollout of one student, (step, row, …); `begun` is (row, memory)."""
 
     x: Tensor
     before: Tensor
@@ -62,43 +62,43 @@ class Lesson(NamedTuple):
 
 
 class Alone:
-    """A student that is taught alone."""
+    """A student trained separately."""
 
     def __init__(self, student: Student, chosen: Chosen):
         self.student, self.chosen = student, chosen
         self.optimiser = torch.optim.Adam(student.parameters(), lr=RATE)
         self.seen: list[Tensor] = []
-        self.label_std: Tensor | None = None  # of all that the teacher has done so far, in all environments
+        self.label_std: Tensor | None = None  # over all of the teacher's actions so far
         self.norms: list[float] = []
 
     def fall(self, share: float) -> None:
-        """Learn at the rate that stands when a share of the run is over."""
+        """Set the learning rate for a finished share of the run."""
         if self.chosen.final_learning_rate is not None:
             logarithm = math.log(RATE) + share * (math.log(self.chosen.final_learning_rate) - math.log(RATE))
             self.optimiser.param_groups[0]["lr"] = math.exp(logarithm)
 
     def acted(self, lesson: Lesson) -> Tensor:
-        """What it would ask for now, (step, row, joint)."""
+        """Return its current actions, (step, row, joint)."""
         actions, memory = [], lesson.begun
         with torch.no_grad():
             for x, ended in zip(lesson.x, lesson.ended, strict=True):
-                made = self.student(x, memory)
-                actions.append(made.action)
-                memory = made.memory * ~ended[:, None]
+                output = self.student(x, memory)
+                actions.append(output.action)
+                memory = output.memory * ~ended[:, None]
         return torch.stack(actions)
 
     def passed(self, lesson: Lesson, is_latest: bool) -> float:
-        """Go through a rollout once; return the mean error of the actions."""
-        before = lesson.before if is_latest else self.acted(lesson)
+        """Train on a rollout once; return the mean error of the actions."""
+        old_actions = lesson.before if is_latest else self.acted(lesson)
         memory, errors = lesson.begun, []
         for first in range(0, STEPS, LENGTH):
             behaviour, decoded = [], []
             for t in range(first, first + LENGTH):
-                action, told, memory = self.student(lesson.x[t], memory)
+                action, numbers, memory = self.student(lesson.x[t], memory)
                 memory = memory * ~lesson.ended[t][:, None]
-                behaviour.append(self.behaviour(action, lesson.label[t], before[t]).mean())
+                behaviour.append(self.behaviour(action, lesson.label[t], old_actions[t]).mean())
                 for k in range(self.chosen.num_decoders):
-                    off = told[:, k] - SCALES[k] * lesson.target[t][:, k]
+                    off = numbers[:, k] - SCALES[k] * lesson.target[t][:, k]
                     decoded.append(WEIGHTS[k] * off.square().mean())
             error = torch.stack(behaviour).mean()
             self.optimiser.zero_grad()
@@ -111,7 +111,7 @@ class Alone:
         return fmean(errors)
 
     def behaviour(self, action: Tensor, label: Tensor, before: Tensor) -> Tensor:
-        """The error of each action."""
+        """Return the error of each action."""
         bound = self.chosen.clip
         error = self.loss(action - label)
         if bound is not None:
@@ -120,7 +120,7 @@ class Alone:
         return error
 
     def loss(self, error: Tensor) -> Tensor:
-        """The loss of a difference, as the docstring of `losses` has it."""
+        """Return the loss of a difference, as documented in `losses`."""
         error = error / torch.tensor(STD) if self.chosen.loss == "inverse_variance" else error
         error = error / self.label_std if self.label_std is not None else error
         if self.chosen.loss == "huber":
@@ -128,7 +128,7 @@ class Alone:
         return error**2
 
     def look(self, lesson: Lesson) -> None:
-        """Normalise from now on by all rows that were seen."""
+        """Normalise from now on by all rows seen so far."""
         self.seen.append(lesson.x.flatten(0, 1))
         rows = torch.cat(self.seen)
         self.student.mean.copy_(rows.mean(dim=0))
@@ -145,12 +145,15 @@ def files(tmp_path_factory):
 
 @pytest.fixture
 def make(files, monkeypatch):
-    """Return a function that makes a distiller, of three students in two stacks, whose networks and rollouts are float64."""
-    made, (task, file) = [], files
+    """Return a function that makes a float64 distiller of three students in two stacks."""
+    envs, (task, file) = [], files
 
     def distiller(kind: str, chosen: Chosen) -> Distiller:
         decoders = [f"{{scale: {scale}, weight: {weight}, hidden: [4]}}" for scale, weight in zip(SCALES, WEIGHTS, strict=True)]
-        named = [f"{name}: {own}" for name, own in zip(("object_size", "goal_distance"), decoders, strict=True)]
+        named = [
+            f"{name}: {student_teacher}"
+            for name, student_teacher in zip(("object_size", "goal_distance"), decoders, strict=True)
+        ]
         spec = {"steps": STEPS, "gradient_length": LENGTH, "epochs": EPOCHS, "learning_rate": RATE}
         spec |= {"loss": chosen.loss, "aggregate": chosen.aggregate, "normalise": chosen.normalise}
         spec |= {name: getattr(chosen, name) or "null" for name in ("clip", "max_grad_norm", "final_learning_rate")}
@@ -160,75 +163,75 @@ def make(files, monkeypatch):
         spec |= {f"networks.{name}": value for name, value in widths.items()}
         loaded = load_task(task, {f"distill.{name}": value for name, value in spec.items()})
         keys = student_keys(["depth", "bool", "none"], ["ends"], ["clean"], 1)
-        own = Teacher(file, loaded)
-        made.append(TouchEnv(loaded, ROWS * len(keys), seed=1, threads=1, feels=feels(keys, own.felt)))
-        bound = own.bound(made[-1])
+        student_teacher = Teacher(file, loaded)
+        envs.append(TouchEnv(loaded, ROWS * len(keys), seed=1, threads=1, feels=feels(keys, student_teacher.felt)))
+        bound = student_teacher.bound(envs[-1])
         monkeypatch.setattr(learner, "Stack", partial(Stack, dtype=torch.float64))
         torch.set_default_dtype(torch.float64)
-        return Distiller(made[-1], loaded, bound, keys, 0)
+        return Distiller(envs[-1], loaded, bound, keys, 0)
 
     yield distiller
     torch.set_default_dtype(torch.float32)
-    for env in made:
+    for env in envs:
         env.close()
 
 
-def filled(found: Distiller, generator: torch.Generator) -> list[Lesson]:
-    """Put made-up rollouts where `roll` puts them; return each student's: episodes end at random, features have offsets."""
+def fill_rollouts(distiller: Distiller, generator: torch.Generator) -> list[Lesson]:
+    """Fill rollouts with made-up data; return each student's. Episodes end at random, features have offsets."""
     lessons = []
-    for own in found.rollouts:
-        for i in range(len(own.keys)):
-            block = slice(own.first + i * own.rows, own.first + (i + 1) * own.rows)
-            x, before, label, target = (
+    for rollout in distiller.rollouts:
+        for i in range(len(rollout.keys)):
+            block = slice(rollout.first + i * rollout.rows, rollout.first + (i + 1) * rollout.rows)
+            x, old_action, label, target = (
                 torch.randn((STEPS, ROWS, size), generator=generator)
-                for size in (own.x.shape[-1], 2, 2, found._privileged.shape[-1])
+                for size in (rollout.x.shape[-1], 2, 2, distiller._privileged.shape[-1])
             )
             ended = torch.rand((STEPS, ROWS), generator=generator) < 0.3
-            begun = torch.randn((ROWS, own.stack.memory), generator=generator)
-            lesson = Lesson(1.0 + 3.0 * x, 0.5 * before, label, 0.1 * target, ended, begun)
+            begun = torch.randn((ROWS, rollout.stack.memory), generator=generator)
+            lesson = Lesson(1.0 + 3.0 * x, 0.5 * old_action, label, 0.1 * target, ended, begun)
             lessons.append(lesson)
-            for room, values in (
-                (own.x[:, i], lesson.x),
-                (own.before[:, i], lesson.before),
-                (own.begun[i], lesson.begun),
-                (found._labels[:, block], lesson.label),
-                (found._privileged[:, block], lesson.target),
-                (found._ended[:, block], lesson.ended),
+            for buffer, values in (
+                (rollout.x[:, i], lesson.x),
+                (rollout.before[:, i], lesson.before),
+                (rollout.begun[i], lesson.begun),
+                (distiller._labels[:, block], lesson.label),
+                (distiller._privileged[:, block], lesson.target),
+                (distiller._ended[:, block], lesson.ended),
             ):
-                room.copy_(values)
+                buffer.copy_(values)
     return lessons
 
 
 @pytest.mark.parametrize(("kind", "chosen"), [("mlp", "plain"), ("mlp", "huber"), ("lstm", "all"), ("convrnn", "all")])
-def test_an_update_is_that_of_separate_students(make, kind, chosen):
+def test_an_update_equals_that_of_separate_students(make, kind, chosen):
     """Weights, normalisation and losses after several updates."""
-    own = CHOSEN[chosen]
-    found, generator, chance = make(kind, own), torch.Generator().manual_seed(0), random.Random(5)
-    found._chance.seed(5)
-    alone = [Alone(found.student(i), own) for i in range(len(found.keys))]
-    kept: list[list[Lesson]] = []
+    options = CHOSEN[chosen]
+    distiller, generator, chance = make(kind, options), torch.Generator().manual_seed(0), random.Random(5)
+    distiller._chance.seed(5)
+    alone = [Alone(distiller.student(i), options) for i in range(len(distiller.keys))]
+    recent: list[list[Lesson]] = []
     labels: list[Tensor] = []
     for number in range(NUM_UPDATES):
-        found.set_rate(number / NUM_UPDATES)
+        distiller.set_rate(number / NUM_UPDATES)
         for each in alone:
             each.fall(number / NUM_UPDATES)
-        kept = [*kept, filled(found, generator)][-own.aggregate :]
-        latest = len(kept) - 1
-        if own.normalise:
-            labels += [lesson.label.flatten(0, 1) for lesson in kept[-1]]
+        recent = [*recent, fill_rollouts(distiller, generator)][-options.aggregate :]
+        latest = len(recent) - 1
+        if options.normalise:
+            labels += [lesson.label.flatten(0, 1) for lesson in recent[-1]]
             for each in alone:
                 each.label_std = torch.cat(labels).std(dim=0, correction=0)
-        passes = [latest] + [chance.randrange(len(kept)) if own.aggregate > 1 else latest for _ in range(EPOCHS - 1)]
-        errors = [[each.passed(kept[i][n], i == latest) for i in passes] for n, each in enumerate(alone)]
-        for each, lesson in zip(alone, kept[-1], strict=True):
+        passes = [latest] + [chance.randrange(len(recent)) if options.aggregate > 1 else latest for _ in range(EPOCHS - 1)]
+        errors = [[each.passed(recent[i][n], i == latest) for i in passes] for n, each in enumerate(alone)]
+        for each, lesson in zip(alone, recent[-1], strict=True):
             each.look(lesson)
-        found.learn()
-        told = found._losses * LENGTH / (EPOCHS * STEPS)
+        distiller.learn()
+        losses = distiller._losses * LENGTH / (EPOCHS * STEPS)
         expected = torch.tensor(errors).mean(dim=1)
-        torch.testing.assert_close(told, expected, rtol=UPDATES, atol=UPDATES)
+        torch.testing.assert_close(losses, expected, rtol=UPDATES, atol=UPDATES)
     for i, each in enumerate(alone):
-        state = found.student(i).state_dict()
+        state = distiller.student(i).state_dict()
         for name, value in each.student.state_dict().items():
             torch.testing.assert_close(state[name], value, rtol=UPDATES, atol=UPDATES)
     norms = [norm for each in alone for norm in each.norms]
-    assert own.max_grad_norm is None or min(norms) < own.max_grad_norm < max(norms)
+    assert options.max_grad_norm is None or min(norms) < options.max_grad_norm < max(norms)

@@ -307,8 +307,8 @@ def busy(tmp_path_factory):
     env = repose(tmp_path_factory.mktemp("busy"), 3, QUICK, "0 0 -9.81")
     for i in range(10):
         env.sim.qvel[:, 6:9] = 3.0
-        made = env.step(torch.tensor([[1.0, -1.0 if i % 3 else -0.8]] * 3))
-        assert torch.stack(list(made.info.terms.values())).sum(dim=0).tolist() == pytest.approx(made.reward.tolist())
+        result = env.step(torch.tensor([[1.0, -1.0 if i % 3 else -0.8]] * 3))
+        assert torch.stack(list(result.info.terms.values())).sum(dim=0).tolist() == pytest.approx(result.reward.tolist())
     for own, value in ((env.task.is_reached, True), (env.task.is_late, True), (env.task.start_pos, 9.0)):
         own.fill_(value)
     return env

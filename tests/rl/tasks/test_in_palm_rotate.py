@@ -122,10 +122,10 @@ def test_turning_to_and_fro_pays_nothing(tmp_path):
         half = torch.full((2,), 0.5 * angle, dtype=torch.float64)
         env.sim.qpos[:, 6:10] = torch.stack([half.cos(), 0 * half, 0 * half, half.sin()], dim=1)
         env.sim.qvel[:] = 0
-        made = env.step(torch.zeros(2, 2))
-        total += made.reward
-        reached += int(made.info.terms["success"][0] > 0)
-    assert reached == 1 and made.info.score.tolist() == [1.0, 1.0]
+        result = env.step(torch.zeros(2, 2))
+        total += result.reward
+        reached += int(result.info.terms["success"][0] > 0)
+    assert reached == 1 and result.info.score.tolist() == [1.0, 1.0]
     assert total[0].item() == pytest.approx(InPalmRotate.Rewards().success * env.control_step, abs=0.02)
 
 
@@ -139,14 +139,14 @@ def test_goals_are_quarter_turns(tmp_path, direction, way):
         angle = torch.tensor(way * 0.05 * i, dtype=torch.float64)
         env.sim.qpos[0, 6:10] = torch.stack([(0.5 * angle).cos(), 0 * angle, 0 * angle, (0.5 * angle).sin()])
         env.sim.qvel[:] = 0
-        made = env.step(torch.zeros(1, 2))
-        if made.info.terms["success"][0] > 0:
+        result = env.step(torch.zeros(1, 2))
+        if result.info.terms["success"][0] > 0:
             reached.append(0.05 * i)
         goal = way * (len(reached) + 1) * math.pi / 2
         expected = [math.cos(goal), math.sin(goal), 0, -math.sin(goal), math.cos(goal), 0]
-        assert made.obs["goal"][0, :6].tolist() == pytest.approx(expected, abs=1e-5)
+        assert result.obs["goal"][0, :6].tolist() == pytest.approx(expected, abs=1e-5)
     assert reached == pytest.approx([k * math.pi / 2 - 0.1 for k in (1, 2)], abs=0.051)
-    assert made.info.score.item() == 2.0
+    assert result.info.score.item() == 2.0
 
 
 def test_a_tilted_object_reaches_no_goal(tmp_path):
@@ -159,6 +159,6 @@ def test_a_tilted_object_reaches_no_goal(tmp_path):
         w, z = turn[:, 0], turn[:, 3]
         env.sim.qpos[:, 6:10] = torch.stack([w * tilt.cos(), w * tilt.sin(), z * tilt.sin(), z * tilt.cos()], dim=1)
         env.sim.qvel[:] = 0
-        made = env.step(torch.zeros(2, 2))
-    assert made.info.score.tolist() == [1.0, 0.0]
+        result = env.step(torch.zeros(2, 2))
+    assert result.info.score.tolist() == [1.0, 0.0]
     assert env.task.tilt.tolist() == pytest.approx([0.0, 0.5], abs=1e-6)

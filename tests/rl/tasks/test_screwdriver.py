@@ -160,10 +160,10 @@ def test_turning_to_and_fro_pays_nothing_however_fast_either_way(env):
     before = env.step(torch.zeros(4, 2)).info.score
     for angle in [*slowly, 0.0, 0.0, 1.0, 1.0, *back, 0.0]:
         place(env, -angle, 0.0)
-        made = env.step(torch.zeros(4, 2))
-        total += made.info.terms["spin"]
+        result = env.step(torch.zeros(4, 2))
+        total += result.info.terms["spin"]
     # The fast way forth pays less than it is worth.
-    assert (total <= 1e-6).all() and (made.info.score - before).tolist() == pytest.approx([0.0] * 4, abs=1e-4)
+    assert (total <= 1e-6).all() and (result.info.score - before).tolist() == pytest.approx([0.0] * 4, abs=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -206,10 +206,10 @@ def test_only_what_is_turned_upright_counts_for_the_score(env):
     before = env.task.score().clone()
     for i in range(1, 9):
         place(env, -0.05 * i, tilt)
-        made = env.step(torch.zeros(4, 2))
-    assert not made.terminated.any()
+        result = env.step(torch.zeros(4, 2))
+    assert not result.terminated.any()
     # Over 10 s, although 0.2 s have passed.
-    assert (made.info.score - before).tolist() == pytest.approx([0.04, 0.04, 0, 0], abs=1e-3)
+    assert (result.info.score - before).tolist() == pytest.approx([0.04, 0.04, 0, 0], abs=1e-3)
     torch.testing.assert_close(env.task.tilt, tilt, rtol=0, atol=1e-4)
 
 
@@ -217,9 +217,9 @@ def test_a_screwdriver_that_has_fallen_or_left_its_screw_ends_the_episode(env):
     env.reset(0)
     place(env, 0.0, torch.tensor([0.79, 0.81, 0.0, 0.0], dtype=torch.float64))
     env.sim.qpos[2:, 5] += torch.tensor([0.0049, 0.0051], dtype=torch.float64)
-    made = env.step(torch.zeros(4, 2))
-    assert made.terminated.tolist() == [False, True, False, True]
-    assert made.info.terms["drop"].tolist() == pytest.approx([0, -2.5, 0, -2.5])
+    result = env.step(torch.zeros(4, 2))
+    assert result.terminated.tolist() == [False, True, False, True]
+    assert result.info.terms["drop"].tolist() == pytest.approx([0, -2.5, 0, -2.5])
     assert env.steps.tolist() == [1, 0, 1, 0] and env.task.turned.tolist()[1] == 0.0
     # The others go on as they were, and those begin with grasps of their own.
     assert (env.task.tilt[[1, 3]] < 0.2).all() and env.task.tilt[0] == pytest.approx(0.79, abs=1e-3)
@@ -269,10 +269,10 @@ def test_the_hand_holds_the_screwdriver_without_an_action():
     env = TouchEnv(DOCUMENT, 16, threads=1, overrides={"touch": "none"})
     dropped = torch.zeros(16, dtype=torch.bool)
     for _ in range(200):
-        made = env.step(torch.zeros(16, 8))
-        dropped |= made.terminated
-        assert not made.info.faults.any() and made.reward.isfinite().all()
-    assert dropped.sum() <= 1 and made.info.score[~dropped].abs().max() < 0.1
+        result = env.step(torch.zeros(16, 8))
+        dropped |= result.terminated
+        assert not result.info.faults.any() and result.reward.isfinite().all()
+    assert dropped.sum() <= 1 and result.info.score[~dropped].abs().max() < 0.1
     tip = env.now.watched.site_pos[:, 0] - env.task.upright_tip
     assert tip.norm(dim=1).max() < 2.5e-3
     env.close()
@@ -284,8 +284,8 @@ def test_kinds_of_touch_of_every_quantity_begin_with_the_same_grasps(touch):
     env = TouchEnv(DOCUMENT, 4, threads=1, overrides={"touch": touch, "resolution": "low", "grasps.num": 16})
     obs = env.reset(0)
     assert obs["tactile_sensors"].abs().amax(dim=1).gt(0).all() and env.now.link_force.norm(dim=2).gt(0.1).sum(dim=1).min() >= 3
-    made = env.step(torch.zeros(4, 8))
-    assert all(value.isfinite().all() for value in made.obs.values())
+    result = env.step(torch.zeros(4, 8))
+    assert all(value.isfinite().all() for value in result.obs.values())
     env.close()
 
 
@@ -296,8 +296,8 @@ def test_a_gait_spins_every_handle_the_right_way():
     env = TouchEnv(DOCUMENT, 16, threads=1, overrides={"touch": "none"})
     obs, dropped, turned = env.reset(1), torch.zeros(16, dtype=torch.bool), torch.zeros(16)
     for _ in range(120):
-        made = env.step(gait(env, obs))
-        obs, dropped = made.obs, dropped | made.terminated
+        result = env.step(gait(env, obs))
+        obs, dropped = result.obs, dropped | result.terminated
         turned += torch.where(dropped, 0.0, env.task.rate.float() * env.control_step)
     assert dropped.sum() <= 8
     rate = (turned / 3.0).view(-1, 4)  # one column per handle

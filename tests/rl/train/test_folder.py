@@ -1,4 +1,4 @@
-"""A run's folder: who runs in it, what a kill has left of its curve, and what is no run."""
+"""A run's folder: its lock, its curve after a kill, and files that are no run."""
 
 import contextlib
 import subprocess
@@ -17,8 +17,8 @@ def row_of(iteration):
     return {"iteration": iteration, "samples": 8 * iteration, "seconds": 0.5 * iteration, "Loss/value": 0.25}
 
 
-def test_a_curve_goes_on_whatever_byte_was_its_last(tmp_path):
-    """Of header and first row any part may have been written when the run was killed; other rows than that are kept."""
+def test_a_curve_resumes_after_any_truncation(tmp_path):
+    """A kill may leave any part of the header and first row; only complete rows are kept."""
     folder = RunFolder(tmp_path)
     for iteration in (1, 2):
         folder.add_row(row_of(iteration))
@@ -27,12 +27,12 @@ def test_a_curve_goes_on_whatever_byte_was_its_last(tmp_path):
     assert header == b"iteration,samples,seconds,Loss/value\n"
     for size in range(len(content) + 1):
         folder.curve.write_bytes(content[:size])
-        whole = (size >= len(header + first)) + (size == len(content))
-        assert [row["iteration"] for row in folder.rows()] == ["1", "2"][:whole], size
+        num_rows = (size >= len(header + first)) + (size == len(content))
+        assert [row["iteration"] for row in folder.rows()] == ["1", "2"][:num_rows], size
         folder.keep_rows(1)
-        assert folder.curve.read_bytes() == (header + first if whole else b""), size
+        assert folder.curve.read_bytes() == (header + first if num_rows else b""), size
         folder.add_row(row_of(2))
-        assert folder.curve.read_bytes() == (content if whole else header + second), size
+        assert folder.curve.read_bytes() == (content if num_rows else header + second), size
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_a_curve_goes_on_whatever_byte_was_its_last(tmp_path):
     ],
     ids=["torn", "zeros", "zeros later", "too few", "too many"],
 )
-def test_what_is_no_curve_is_refused_before_a_run_goes_on(tmp_path, text, line, found):
+def test_an_invalid_curve_is_refused_before_a_run_resumes(tmp_path, text, line, found):
     folder = RunFolder(tmp_path)
     folder.checkpoint.write_bytes(b"")
     folder.curve.write_text(text)
@@ -57,8 +57,8 @@ def test_what_is_no_curve_is_refused_before_a_run_goes_on(tmp_path, text, line, 
     assert folder.curve.read_text() == text
 
 
-def is_held(folder):
-    """Whether the folder is refused to who comes second."""
+def is_locked(folder):
+    """Return whether a second lock of the folder is refused."""
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(folder.lock())
@@ -68,11 +68,11 @@ def is_held(folder):
 
 
 def test_two_processes_do_not_run_in_one_folder(tmp_path):
-    """A run holds it, by a lock of the folder; when a process that holds one is killed, it is free."""
+    """A run locks its folder; killing the process releases the lock."""
     folder = RunFolder(tmp_path / "run")
     with folder.lock():
-        assert is_held(RunFolder(folder.path))
-    assert not is_held(folder)
+        assert is_locked(RunFolder(folder.path))
+    assert not is_locked(folder)
     folder.path.mkdir(exist_ok=True)
     code = (
         "import fcntl, os, sys, time; fcntl.flock(os.open(sys.argv[1], 0), fcntl.LOCK_EX); print(flush=True); time.sleep(600)"
@@ -80,21 +80,21 @@ def test_two_processes_do_not_run_in_one_folder(tmp_path):
     with subprocess.Popen([sys.executable, "-c", code, str(folder.path)], stdout=subprocess.PIPE) as other:
         assert other.stdout is not None
         other.stdout.readline()
-        assert is_held(folder)
+        assert is_locked(folder)
         other.kill()
         other.wait()
-        assert not is_held(folder) and list(folder.path.iterdir()) == []
+        assert not is_locked(folder) and list(folder.path.iterdir()) == []
 
 
 @pytest.mark.parametrize("text", ["[]", '{"runs": 3}', "{", "\0"])
-def test_a_file_that_tells_no_starts_is_refused(tmp_path, text):
+def test_a_run_file_without_starts_is_refused(tmp_path, text):
     folder = RunFolder(tmp_path)
     folder.run.write_text(text)
     with pytest.raises(TgdslError, match=r"run\.json: (expected a file that tgdsl wrote|cannot read this file)"):
         folder.last_start()
 
 
-def test_files_that_were_only_moved_are_no_change(tmp_path, monkeypatch):
+def test_moving_files_is_not_a_change(tmp_path, monkeypatch):
     origins = []
     for name in ("here", "there"):
         folder = tmp_path / name

@@ -1,4 +1,4 @@
-"""Policies as files, with their cards."""
+"""Policy files and their cards."""
 
 import json
 
@@ -13,8 +13,8 @@ from tgdsl.rl.train.folder import run_origin
 pytestmark = [pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning"), pytest.mark.usefixtures("no_onnx")]
 
 
-def test_sensors_that_environments_lack_are_not_compared(tmp_path):
-    """On a hand there is what the policy feels with, and not what only its task reads; but something must be there."""
+def test_sensors_that_the_environments_lack_are_not_compared(tmp_path):
+    """A hand has the policy's sensors but not those of its task only; at least one must be present."""
     learner, loaded = small_learner(tmp_path, train__actor="[tactile_sensors, proprio]")
     file = tmp_path / "policy.pt"
     card = learner.card(run_origin(loaded, learner.env, 0, {}, 1), 0.0, "tgdsl train task.yaml") | {"taxels": "0"}
@@ -22,10 +22,10 @@ def test_sensors_that_environments_lack_are_not_compared(tmp_path):
     extra = {"card.json": "", "taxels.csv": ""}
     module = torch.jit.load(file, _extra_files=extra)
     head, *rows = extra["taxels.csv"].decode().splitlines(keepends=True)
-    others = [f"nowhere,{row.partition(',')[2]}" for row in rows]
-    for text, is_fit in ((head + "".join(rows + others), True), (head + "".join(others), False)):
+    unknown_rows = [f"nowhere,{row.partition(',')[2]}" for row in rows]
+    for text, is_accepted in ((head + "".join(rows + unknown_rows), True), (head + "".join(unknown_rows), False)):
         torch.jit.save(module, file, _extra_files={"card.json": extra["card.json"], "taxels.csv": text})
-        if is_fit:
+        if is_accepted:
             policy_for(learner.env, read_policy(file))
         else:
             with pytest.raises(PolicyError, match='other taxels: this module: there is no sensor "nowhere", whose taxels'):
@@ -33,7 +33,6 @@ def test_sensors_that_environments_lack_are_not_compared(tmp_path):
 
 
 def test_taxels_may_differ_by_rounding(tmp_path):
-    """The table in the file says by how much."""
     learner, loaded = small_learner(tmp_path, train__actor="[tactile_sensors, proprio]")
     file, touch = tmp_path / "policy.pt", learner.env.touch
     card = learner.card(run_origin(loaded, learner.env, 0, {}, 1), 0.0, "tgdsl train task.yaml") | {"taxels": "0"}
@@ -43,10 +42,10 @@ def test_taxels_may_differ_by_rounding(tmp_path):
         for column in ("link", "body", "pos", "normal", "tangent", "radius", "area", "row", "column"):
             np.testing.assert_array_equal(saved.taxels[name][column], table[column])
     sensor, taxel = next((name, table[0]) for name, table in touch.taxels.items() if len(table))
-    for by, is_same in ((1e-7, True), (-1e-7, True), (1e-5, False)):
+    for offset, is_same in ((1e-7, True), (-1e-7, True), (1e-5, False)):
         extra = {"card.json": "", "taxels.csv": ""}
         module = torch.jit.load(file, _extra_files=extra)
-        text = extra["taxels.csv"].decode().replace(repr(float(taxel["pos"][0])), repr(float(taxel["pos"][0]) + by), 1)
+        text = extra["taxels.csv"].decode().replace(repr(float(taxel["pos"][0])), repr(float(taxel["pos"][0]) + offset), 1)
         torch.jit.save(module, tmp_path / "other.pt", _extra_files={"card.json": extra["card.json"], "taxels.csv": text})
         other = read_policy(tmp_path / "other.pt")
         if is_same:
@@ -57,10 +56,10 @@ def test_taxels_may_differ_by_rounding(tmp_path):
                 policy_for(learner.env, other)
 
 
-def test_a_policy_brings_its_card(tmp_path):
-    """It acts as the network without exploration; a touchless one takes any taxels.
+def test_a_policy_is_checked_against_its_card(tmp_path):
+    """It acts as the network without exploration; a policy without touch accepts any taxels.
 
-    Other joints are refused, and tasks, actions and control steps other than those that it was learned with.
+    Other joints, tasks, actions and control steps than those of its training are refused.
     """
     learner, loaded = small_learner(tmp_path, train__actor="[tactile_sensors, proprio]")
     learner.iterate()
@@ -97,17 +96,19 @@ def test_a_policy_brings_its_card(tmp_path):
         PolicyError, match=r"takes tactile_sensors \(4\) \+ proprio \(6\) = 10, not proprio \(6\) \+ tactile_sensors"
     ):
         policy_for(env, read_policy(file), ("proprio", "tactile_sensors"))
-    less = {name: value for name, value in learned["action"].items() if name != "smoothing"}  # of an older tgdsl
-    rounded = learned["action"] | {"scale": learned["action"]["scale"] * (1.0 + 1e-15)}  # 0.7 cm are not quite 7 mm
-    for action in (less, rounded):
+    older_action = {
+        name: value for name, value in learned["action"].items() if name != "smoothing"
+    }  # as an older tgdsl wrote it
+    rounded = learned["action"] | {"scale": learned["action"]["scale"] * (1.0 + 1e-15)}  # 0.7 cm is not exactly 7 mm
+    for action in (older_action, rounded):
         learner.write_policy(card | {"spec": learned | {"action": action}}, file)
         assert policy_for(env, read_policy(file)).groups == ("tactile_sensors", "proprio")
     pushes = {"push": {**learned["randomise"]["push"], "interval": [2.0 * (1.0 + 1e-15), 4.0]}}
-    for before, expected in (
+    for difference, expected in (
         ({"episode": learned["episode"] * (1.0 + 1e-15), "randomise": learned["randomise"] | pushes}, []),
         ({"episode": 2.0 * learned["episode"]}, [f"episode: {2.0 * learned['episode']}, now {learned['episode']}"]),
     ):
-        learner.write_policy(card | {"spec": learned | before}, file)
+        learner.write_policy(card | {"spec": learned | difference}, file)
         assert policy_for(env, read_policy(file)).changes == expected
     blind, _ = small_learner(tmp_path)
     blind.write_policy(card | {"taxels": "0", "groups": {name: env.groups[name] for name in blind.groups["actor"]}}, file)

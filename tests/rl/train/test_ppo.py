@@ -1,4 +1,4 @@
-"""PPO that is captured does what rsl_rl's own does, in float64, whatever is switched on."""
+"""CapturedPPO equals rsl_rl's PPO in float64, for all options."""
 
 import contextlib
 import copy
@@ -54,16 +54,16 @@ def settings(is_ours, rnd=None, std_range=None, **algorithm):
 
 
 def algorithm_of(is_ours, env, **options):
-    """Make an algorithm with networks that are the same for both."""
-    wanted = settings(is_ours, **options)
+    """Make an algorithm whose networks are the same for both kinds."""
+    config = settings(is_ours, **options)
     kind = CapturedPPO if is_ours else PPO
     torch.manual_seed(0)
     with contextlib.redirect_stdout(io.StringIO()):
-        return kind.construct_algorithm(env.get_observations(), env, wanted, "cpu")
+        return kind.construct_algorithm(env.get_observations(), env, config, "cpu")
 
 
 def iterate(algorithm, env, seed, steps=STEPS):
-    """Make one iteration; what is random follows from the seed, before the rollout and before the update."""
+    """Run one iteration; the seed determines both the rollout and the update."""
     algorithm.train_mode()
     obs = env.get_observations()
     torch.manual_seed(2 * seed)
@@ -77,7 +77,7 @@ def iterate(algorithm, env, seed, steps=STEPS):
 
 
 def tensors_of(algorithm):
-    """Return all that has been learned, by name."""
+    """Return all learned tensors by name."""
     models = {"actor": algorithm.actor, "critic": algorithm.critic}
     if algorithm.rnd:
         models |= {"predictor": algorithm.rnd.predictor, "state": algorithm.rnd.state_normalizer}
@@ -94,29 +94,36 @@ def tensors_of(algorithm):
         pytest.param({"schedule": "fixed", "use_clipped_value_loss": False, "optimizer": "adamw"}, "stays", id="fixed"),
     ],
 )
-def test_it_equals_rsl_rl_s_own(options, rates):
-    """Three iterations from the same weights, with the same numbers drawn and the same mini-batches."""
+def test_captured_ppo_equals_rsl_rls(options, rates):
+    """Three iterations from the same weights, with the same random numbers and mini-batches."""
     ours, theirs = (algorithm_of(is_ours, Drifting(NUM_ENVS), **options) for is_ours in (True, False))
     envs = [Drifting(NUM_ENVS), Drifting(NUM_ENVS)]
-    begun = theirs.learning_rate
-    seen = [begun]
+    first_rate = theirs.learning_rate
+    seen_rates = [first_rate]
     for seed in range(3):
-        found, wanted = iterate(ours, envs[0], seed), iterate(theirs, envs[1], seed)
-        assert found == pytest.approx(wanted, rel=1e-9, abs=1e-12)
+        losses, expected = iterate(ours, envs[0], seed), iterate(theirs, envs[1], seed)
+        assert losses == pytest.approx(expected, rel=1e-9, abs=1e-12)
         assert ours.learning_rate == pytest.approx(theirs.learning_rate, rel=1e-14)
-        seen.append(theirs.learning_rate)
+        seen_rates.append(theirs.learning_rate)
         torch.testing.assert_close(ours.storage.returns, theirs.storage.returns, rtol=1e-10, atol=1e-12)
         torch.testing.assert_close(ours.storage.advantages, theirs.storage.advantages, rtol=1e-9, atol=1e-11)
-    own, other = tensors_of(ours), tensors_of(theirs)
-    assert own.keys() == other.keys()
-    for name, value in other.items():
-        torch.testing.assert_close(own[name], value, rtol=1e-8, atol=1e-11, msg=lambda text, name=name: f"{name}: {text}")
-    rises = {"rises": max(seen) == 1e-2, "falls": min(seen) < begun / 2, "stays": set(seen) == {begun}, None: True}
-    assert rises[rates], seen
+    our_tensors, their_tensors = tensors_of(ours), tensors_of(theirs)
+    assert our_tensors.keys() == their_tensors.keys()
+    for name, value in their_tensors.items():
+        torch.testing.assert_close(
+            our_tensors[name], value, rtol=1e-8, atol=1e-11, msg=lambda text, name=name: f"{name}: {text}"
+        )
+    is_as_expected = {
+        "rises": max(seen_rates) == 1e-2,
+        "falls": min(seen_rates) < first_rate / 2,
+        "stays": set(seen_rates) == {first_rate},
+        None: True,
+    }
+    assert is_as_expected[rates], seen_rates
 
 
-def test_exploration_stays_within_its_bounds_and_leaves_them_again():
-    """Of a policy that would rather not explore; at the bound, actions far from the mean still ask for more of it."""
+def test_exploration_stays_in_bounds_and_can_leave_the_bound():
+    """The policy is rewarded for less exploration; at the bound, distant actions still raise it."""
     env = Drifting(NUM_ENVS)
     free, bound = (algorithm_of(True, env, std_range=r, entropy_coef=-0.1) for r in ((1e-6, 1e6), (0.75, 1e6)))
     for algorithm in (free, bound):
@@ -130,7 +137,7 @@ def test_exploration_stays_within_its_bounds_and_leaves_them_again():
     assert (distribution.std_param.grad > 0).all()
 
 
-def test_what_cannot_be_captured_is_refused_by_name():
+def test_unsupported_options_are_refused_by_name():
     with pytest.raises(TgdslError, match="CapturedPPO does without use_mixed_precision: take rsl_rl's own PPO"):
         algorithm_of(True, Drifting(NUM_ENVS), use_mixed_precision=True)
     with pytest.raises(TgdslError, match="does without optimizer sgd"):
@@ -138,14 +145,14 @@ def test_what_cannot_be_captured_is_refused_by_name():
 
 
 @pytest.mark.parametrize(("num_envs", "parts", "least"), [(1, 32, 32), (1, 1, 2)])
-def test_a_rollout_of_fewer_rows_than_parts_is_refused(monkeypatch, num_envs, parts, least):
+def test_a_rollout_with_fewer_rows_than_mini_batches_is_refused(monkeypatch, num_envs, parts, least):
     monkeypatch.setattr(sys.modules[__name__], "STEPS", 1)
     with pytest.raises(TgdslError, match=f"are 1 rows of a rollout, expected at least {least}: train.mini_batches is {parts}"):
         algorithm_of(True, Drifting(num_envs), num_mini_batches=parts)
 
 
-def test_it_goes_on_where_it_was_saved(tmp_path):
-    """Another one that loads what was saved makes the next iteration the same, on environments in the same state."""
+def test_a_saved_algorithm_resumes_exactly(tmp_path):
+    """On environments in the same state, the next iteration is equal after loading."""
     env = Drifting(NUM_ENVS)
     first = algorithm_of(True, env, rnd=RND)
     iterate(first, env, 0)
@@ -156,8 +163,8 @@ def test_it_goes_on_where_it_was_saved(tmp_path):
             parameter += 1.0
     other.load(torch.load(tmp_path / "saved.pt", weights_only=True), None, True)
     other.rnd.reward_normalizer.total.copy_(first.rnd.reward_normalizer.total)
-    again = copy.deepcopy(env)
-    assert iterate(first, env, 1) == iterate(other, again, 1)
+    env_copy = copy.deepcopy(env)
+    assert iterate(first, env, 1) == iterate(other, env_copy, 1)
     assert first.learning_rate == other.learning_rate
     for name, value in tensors_of(first).items():
         assert torch.equal(tensors_of(other)[name], value), name

@@ -1,4 +1,4 @@
-"""On a GPU: what is captured does what it does when it is not, and the host never waits."""
+"""On a GPU: captured PPO equals eager PPO, and the host never waits."""
 
 import pytest
 import torch
@@ -31,7 +31,7 @@ def algorithm_of(env):
     encoders = {"*": {"hidden": [32], "size": 8}}
     model = {"class_name": "tgdsl.rl.train.model:EncodedModel", "hidden_dims": [32], "encoders": encoders}
     gaussian = {"class_name": "tgdsl.rl.train.model:Gaussian", "init_std": 0.8}
-    wanted = {
+    config = {
         "num_steps_per_env": STEPS,
         "multi_gpu": None,
         "obs_groups": {"actor": ["here", "there"], "critic": ["here", "there", "still"], "rnd_state": ["here"]},
@@ -40,7 +40,7 @@ def algorithm_of(env):
         "algorithm": {"class_name": "tgdsl.rl.train.ppo:CapturedPPO", "rnd_cfg": dict(RND), "precision": "float32"},
     }
     torch.manual_seed(0)
-    return CapturedPPO.construct_algorithm(env.get_observations().to("cuda"), env, wanted, "cuda")
+    return CapturedPPO.construct_algorithm(env.get_observations().to("cuda"), env, config, "cuda")
 
 
 def parts_of(algorithm):
@@ -58,7 +58,7 @@ def roll(algorithm, env):
     return obs
 
 
-def test_what_is_captured_does_what_it_does_when_it_is_not():
+def test_captured_equals_eager():
     """Three updates from the same rollouts."""
     env = Drifting(NUM_ENVS, dtype=torch.float32)
     captured, eager = algorithm_of(env), algorithm_of(env)
@@ -83,18 +83,18 @@ def test_what_is_captured_does_what_it_does_when_it_is_not():
     assert isinstance(captured.actor, EncodedModel)
 
 
-def test_drawn_actions_are_gaussian_and_new_at_each_call():
+def test_actions_are_gaussian_and_differ_between_calls():
     env = Drifting(NUM_ENVS, dtype=torch.float32)
     algorithm = algorithm_of(env)
     obs = env.get_observations().to("cuda")
-    drawn = torch.stack([algorithm.act(obs).clone() for _ in range(200)])
-    own = algorithm.transition.distribution_params
-    noise = (drawn - own[0]) / own[1]
+    samples = torch.stack([algorithm.act(obs).clone() for _ in range(200)])
+    params = algorithm.transition.distribution_params
+    noise = (samples - params[0]) / params[1]
     assert abs(float(noise.mean())) < 0.02 and abs(float(noise.std()) - 1.0) < 0.02
-    assert not (drawn[5:] == drawn[4:-1]).any()
+    assert not (samples[5:] == samples[4:-1]).any()
 
 
-def test_the_host_waits_for_nothing(tmp_path):
+def test_the_host_never_waits(tmp_path):
     document = write_task(tmp_path)
     env = tiny_env(tmp_path, num_envs=NUM_ENVS, device="cuda")
     learner = Learner(env, load_task(document), seed=0)
@@ -108,6 +108,6 @@ def test_the_host_waits_for_nothing(tmp_path):
             learner.learn()
     finally:
         torch.cuda.set_sync_debug_mode("default")
-    found = learner.iterate()
-    assert all(torch.isfinite(torch.tensor(list(found.metrics.values()))))
+    iteration = learner.iterate()
+    assert all(torch.isfinite(torch.tensor(list(iteration.metrics.values()))))
     env.close()
