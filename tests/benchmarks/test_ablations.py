@@ -1,4 +1,4 @@
-"""`benchmarks/ablations.py`: what is kept of runs, and the page that is written from it."""
+"""`benchmarks/ablations.py`: collected runs, and the page that is written from them."""
 
 import csv
 import json
@@ -39,7 +39,7 @@ from tgdsl.rl.load import load_task
 
 STEPS_OF_EACH = ITERATIONS * STEPS * ROWS
 LEVEL = {"force": lambda x: 10.0, "bool": lambda x: 8.0, "depth": lambda x: 9.9, "proximity": lambda x: 4.0 * x}
-"""Three that have levelled off, the last of them beside the first, and one that still rises."""
+"""Three flat curves, the last one close to the first, and one that still rises."""
 BLIND = LEVEL | {"none": lambda x: 1.0}
 
 
@@ -50,13 +50,14 @@ def evaluation(file, score, task="in_palm_rotate"):
 
 @pytest.fixture
 def kept(tmp_path):
-    """Keep a made-up run; return the folder of all that is kept."""
+    """Return a function that collects a made-up run and returns the folder of all of them."""
 
     def keep(name="made_up", scores=BLIND, **options):
         run = made_up_run(tmp_path / f"run_{name}", scores, **options)
-        known = {"teacher": 12.0, "rest": 0.0} if options.get("task") != "grip_force" else {"teacher": 0.0, "rest": 10.0}
+        scores_of = {"teacher": 12.0, "rest": 0.0} if options.get("task") != "grip_force" else {"teacher": 0.0, "rest": 10.0}
         files = [
-            evaluation(tmp_path / f"{who}.json", score, options.get("task", "in_palm_rotate")) for who, score in known.items()
+            evaluation(tmp_path / f"{who}.json", score, options.get("task", "in_palm_rotate"))
+            for who, score in scores_of.items()
         ]
         collect(run, name, *files, into=tmp_path / "kept")
         return tmp_path / "kept"
@@ -70,51 +71,58 @@ def rows_of(file):
 
 
 def test_a_curve_is_thinned_to_means_over_equal_spans(kept):
-    """300 iterations are 60 rows of five; of a straight line each is its middle, but for iterations that do not count.
+    """300 iterations become 60 rows of five; rows of a straight line are means over the iterations that count.
 
-    Those are ones in which no episode ended, and the first 17 of each leg, as long as an episode.
+    Iterations in which no episode ended do not count, nor do the first 17 of each leg, the length of an episode.
     """
     rows = rows_of(kept() / "made_up" / "med" / "curve.csv")
     assert [row["samples"] for row in rows] == [f"{5 * STEPS * ROWS * i}" for i in range(1, 61)]
     assert rows[0]["seconds"] == "25" and rows[-1]["seconds"] == f"{5 * ITERATIONS}"
     counted = {i for i in range(1, ITERATIONS + 1) if i % 3 and not any(first < i <= first + PART for first in LEGS)}
-    told = [[i for i in range(5 * k + 1, 5 * k + 6) if i in counted] for k in range(60)]
-    expected = [4.0 * sum(own) / len(own) / ITERATIONS + 0.01 if own else math.nan for own in told]
-    found = [float(row["Score/proximity-hand-clean-s1"] or "nan") for row in rows]
-    assert found == pytest.approx(expected, rel=1e-3, nan_ok=True) and sum(map(math.isnan, found)) == 6
+    iterations = [[i for i in range(5 * k + 1, 5 * k + 6) if i in counted] for k in range(60)]
+    expected = [4.0 * sum(span) / len(span) / ITERATIONS + 0.01 if span else math.nan for span in iterations]
+    scores = [float(row["Score/proximity-hand-clean-s1"] or "nan") for row in rows]
+    assert scores == pytest.approx(expected, rel=1e-3, nan_ok=True) and sum(map(math.isnan, scores)) == 6
     assert float(rows[0]["Loss/none-s0"]) == pytest.approx(sum(1 / i for i in range(1, 6)) / 5, rel=1e-3)
     means = [value for row in rows for name, value in row.items() if "/" in name and "e" not in value]
     assert all(len(value.replace(".", "").lstrip("0")) <= 4 for value in means)
 
 
-def test_what_has_flattened_is_worse_than_what_lies_above_and_does_not_fall(kept):
-    found = judged(read_ablation(kept() / "made_up"))
-    assert {own.taught.row.type: own.is_flat for own in found} == dict.fromkeys(BLIND, True) | {"proximity": False}
-    worse = {own.taught.row.type: {other.taught.row.type for other in worse_than(own, found, False)} for own in found}
+def test_flat_curves_are_worse_than_those_above_that_do_not_fall(kept):
+    verdicts = judged(read_ablation(kept() / "made_up"))
+    assert {verdict.taught.row.type: verdict.is_flat for verdict in verdicts} == dict.fromkeys(BLIND, True) | {
+        "proximity": False
+    }
+    worse = {
+        verdict.taught.row.type: {other.taught.row.type for other in worse_than(verdict, verdicts, False)}
+        for verdict in verdicts
+    }
     assert worse == {
         "force": set(),
         "bool": {"force", "depth"},
         "depth": set(),
         "proximity": set(),
-        "none": {"force", "depth", "bool", "proximity"},  # which rises still
+        "none": {"force", "depth", "bool", "proximity"},  # which still rises
     }
 
 
-def test_of_one_seed_nothing_is_called_worse(kept):
-    """Its interval knows nothing of seeds."""
-    found = judged(read_ablation(kept(seeds=1) / "made_up"))
-    assert sum(bool(own.is_flat) for own in found) == 4 and not any(worse_than(own, found, False) for own in found)
+def test_with_one_seed_nothing_is_called_worse(kept):
+    """Its interval does not include differences between seeds."""
+    verdicts = judged(read_ablation(kept(seeds=1) / "made_up"))
+    assert sum(bool(verdict.is_flat) for verdict in verdicts) == 4 and not any(
+        worse_than(verdict, verdicts, False) for verdict in verdicts
+    )
     assert "0 of 10 pairs of types" in tables(kept("again", seeds=1))
 
 
-def test_a_teacher_that_is_no_better_than_rest(kept, tmp_path):
-    """No curve can be flat within nothing."""
+def test_with_a_teacher_no_better_than_rest_no_curve_is_flat(kept, tmp_path):
+    """The tolerance of flatness is then zero."""
     folder = kept()
     evaluation(folder / "made_up" / "rest.json", 12.0)
     assert "Flat: within ±0 over the last third" in tables(folder) and "0 of 5 curves are flat." in tables(folder)
 
 
-def test_page_and_plots_are_written_together_into_folders_that_are_made(kept, tmp_path):
+def test_page_and_plots_are_written_into_new_folders(kept, tmp_path):
     page = tmp_path / "docs" / "background" / "page.md"
     page.parent.mkdir(parents=True)
     page.write_text(f"before\n{BEGIN}\n{END}\nafter\n")
@@ -123,11 +131,11 @@ def test_page_and_plots_are_written_together_into_folders_that_are_made(kept, tm
     assert "### made_up" in page.read_text()
 
 
-def test_what_was_kept_of_another_teacher_or_task_is_no_yardstick(kept, tmp_path):
+def test_evaluations_of_another_teacher_or_task_are_refused(kept, tmp_path):
     folder = kept()
     other = made_up_run(tmp_path / "other", BLIND)
-    asked = json.loads((other / "distill.json").read_text())
-    (other / "distill.json").write_text(json.dumps(asked | {"teacher": "policies/y.pt"}))
+    options = json.loads((other / "distill.json").read_text())
+    (other / "distill.json").write_text(json.dumps(options | {"teacher": "policies/y.pt"}))
     with pytest.raises(KeptError, match=r"is of policies/x.pt, and this run was taught by policies/y.pt: give --teacher"):
         collect(other, "made_up", into=folder)
     collect(other, "made_up", evaluation(tmp_path / "y.json", 11.0), into=folder)
@@ -137,14 +145,14 @@ def test_what_was_kept_of_another_teacher_or_task_is_no_yardstick(kept, tmp_path
         collect(gripped, "made_up", into=folder)
 
 
-def test_resolutions_with_a_dot_in_their_names(tmp_path):
+def test_names_of_resolutions_may_have_a_dot(tmp_path):
     run = made_up_run(tmp_path / "run", LEVEL, places=[("hand", "1.5mm", "clean")])
     for _ in range(2):
         collect(run, "dots", into=tmp_path / "kept")
     assert read_ablation(tmp_path / "kept" / "dots").taught[0].row.resolution == "1.5mm"
 
 
-def test_of_an_error_less_is_better(kept):
+def test_smaller_errors_are_better(kept):
     text = tables(kept(task="grip_force"))
     rows = {line.split("`")[1]: line for line in text.splitlines() if line.startswith("| `")}
     assert list(rows) == ["proximity", "bool", "depth", "force", "none"]
@@ -155,29 +163,29 @@ def test_of_an_error_less_is_better(kept):
     assert "of the paper's" not in text and "The paper does not have this task." in text
 
 
-def test_where_all_curves_are_flat_nothing_is_open(kept):
+def test_nothing_is_open_if_all_curves_are_flat(kept):
     text = tables(kept(scores={name: BLIND[name] for name in ("force", "bool", "none")}))
     rows = {line.split("`")[1]: line for line in text.splitlines() if line.startswith("| `")}
     assert rows["force"].endswith("| yes | – |") and rows["bool"].endswith("| yes | `force` |")
 
 
-def test_without_a_yardstick_no_curve_is_flat(kept, tmp_path):
+def test_without_teacher_and_rest_no_curve_is_flat(kept, tmp_path):
     folder = kept()
     (folder / "made_up" / "rest.json").unlink()
-    assert judged(read_ablation(folder / "made_up"))[0].is_flat  # what feels nothing stands in for rest
+    assert judged(read_ablation(folder / "made_up"))[0].is_flat  # the student without touch replaces rest
     (folder / "made_up" / "teacher.json").unlink()
-    assert {own.is_flat for own in judged(read_ablation(folder / "made_up"))} == {None}
+    assert {verdict.is_flat for verdict in judged(read_ablation(folder / "made_up"))} == {None}
     assert "no curve is called flat" in tables(folder) and "0 of 5 curves are flat." in tables(folder)
 
 
-def test_placements_resolutions_and_noises(kept):
-    """What feels nothing is in each resolution once, and is compared with all that is felt at it."""
+def test_types_are_compared_within_each_placement_resolution_and_noise(kept):
+    """Students without touch appear once per resolution, compared with every type at it."""
     places = [
         (where, density, noise) for density in ("low", "med") for where in ("tips", "hand") for noise in ("clean", "noisy")
     ]
     folder = kept(scores={"force": lambda x: 5.0, "none": lambda x: 1.0}, places=places)
     ablation = read_ablation(folder / "made_up")
-    assert [own.row.resolution for own in ablation.taught if own.row.type == "none"] == ["low", "med"]
+    assert [taught.row.resolution for taught in ablation.taught if taught.row.type == "none"] == ["low", "med"]
     text = tables(folder)
     assert "separates 8 of 8 pairs of types in the same place" in text and "is worse than hand" not in text
     table = rows_of(folder / "made_up" / "table.csv")
@@ -190,8 +198,8 @@ def test_placements_resolutions_and_noises(kept):
         writer.writerows(table)
     blind = next(line for line in tables(folder).splitlines() if line.startswith("| `none` | low"))
     assert blind.endswith("| yes | `force` |")
-    told = [line for line in tables(folder).splitlines() if line.startswith("- ")]
-    assert told == [
+    bullets = [line for line in tables(folder).splitlines() if line.startswith("- ")]
+    assert bullets == [
         "- `force`, low, clean: placement tips is worse than hand.",
         "- `force`, med, clean: placement tips is worse than hand.",
         "- `force`, tips, low: noise clean is worse than noisy.",
@@ -203,7 +211,7 @@ def test_placements_resolutions_and_noises(kept):
 
 
 @pytest.mark.slow
-def test_the_page_has_the_samples_of_the_paper_and_is_the_same_again(kept, tmp_path):
+def test_the_page_gives_samples_of_the_paper_and_is_repeatable(kept, tmp_path):
     assert paper_samples("in_palm_rotate") == 1_179_648_000 and paper_samples("screwdriver") == 196_608_000
     folder, page = kept(), tmp_path / "docs" / "background" / "ablations.md"
     kept("another", LEVEL)
@@ -220,14 +228,14 @@ def test_the_page_has_the_samples_of_the_paper_and_is_the_same_again(kept, tmp_p
     assert [file.read_bytes() for file in write_page(folder, page)] == first
 
 
-def test_the_committed_pages_are_those_of_the_kept_results():
+def test_the_committed_pages_match_the_kept_results():
     text, page = (file.read_text(encoding="utf-8") for file in (RECORD, PAGE))
     assert text == written(text, tables()), "run: python benchmarks/ablations.py page"
     assert page == written(page, summary(), PAGE, SUMMARY), "run: python benchmarks/ablations.py page"
-    found = kept_ablations()
-    pictures = {PAGE.parents[1] / "images" / f"ablation_{series_of(own.name)}.png" for own in found}
+    collected = kept_ablations()
+    pictures = {PAGE.parents[1] / "images" / f"ablation_{series_of(ablation.name)}.png" for ablation in collected}
     assert sorted((PAGE.parents[1] / "images").glob("ablation_*.png")) == sorted(pictures)
-    sizes = [sum(file.stat().st_size for file in (KEPT / own.name).rglob("*.*")) for own in found]
+    sizes = [sum(file.stat().st_size for file in (KEPT / ablation.name).rglob("*.*")) for ablation in collected]
     assert all(size <= LIMIT for size in sizes)
 
 
@@ -239,18 +247,18 @@ def test_the_summary_has_a_row_per_type_and_a_column_per_place(kept):
     assert scores["teacher"] == 12.0 and scores["none"] < scores["bool"] < scores["force"]
 
 
-def test_of_nothing_the_page_says_so(tmp_path):
+def test_the_page_says_that_nothing_is_kept(tmp_path):
     assert tables(tmp_path) == NOTHING
 
 
 def test_no_local_paths_are_kept(kept):
-    own = {"grasps.file": "/somewhere/else/grasps.npz", "x": f"{PAGE}"}
-    text = (kept(overrides=own) / "made_up" / "distill.json").read_text()
+    overrides = {"grasps.file": "/somewhere/else/grasps.npz", "x": f"{PAGE}"}
+    text = (kept(overrides=overrides) / "made_up" / "distill.json").read_text()
     assert json.loads(text)["overrides"] == {"grasps.file": "grasps.npz", "x": "docs/background/ablations.md"}
     assert str(PAGE.parents[1]) not in text
 
 
-def test_sixty_students_find_room(tmp_path):
+def test_sixty_students_fit_the_size_limit(tmp_path):
     """Ten types at two placements, three seeds: 60 students."""
     scores = {
         name: (lambda x, i=i: 1.0 / 3.0 + i * x) for i, name in enumerate([*LEVEL, "force_torque", "elastomer", "agg_bool"])
@@ -261,7 +269,7 @@ def test_sixty_students_find_room(tmp_path):
 
 
 @pytest.mark.slow
-def test_mistakes(tmp_path, capsys, monkeypatch):
+def test_invalid_runs_and_arguments_are_refused(tmp_path, capsys, monkeypatch):
     def refused(change=lambda run: None, name="name", **options):
         shutil.rmtree(tmp_path / "run", ignore_errors=True)
         run = made_up_run(tmp_path / "run", options.pop("scores", LEVEL), **options.pop("made", {}))
@@ -279,8 +287,10 @@ def test_mistakes(tmp_path, capsys, monkeypatch):
     assert "found the columns a, b, expected type, placement" in refused(
         lambda run: (run / "table.csv").write_text("a,b\n1,2\n")
     )
-    asked = {"resolutions": ["med", "low"]}
-    assert 'no row of the resolution "low"' in refused(lambda run: (run / "distill.json").write_text(json.dumps(asked)))
+    options_of_run = {"resolutions": ["med", "low"]}
+    assert 'no row of the resolution "low"' in refused(
+        lambda run: (run / "distill.json").write_text(json.dumps(options_of_run))
+    )
     assert "distill.json: there are no resolutions" in refused(lambda run: (run / "distill.json").write_text("{}"))
     stale = refused(made={"is_stale": True})
     assert (
@@ -295,14 +305,14 @@ def test_mistakes(tmp_path, capsys, monkeypatch):
     assert "there is no evaluation of force-hand-clean-s0" in refused(
         lambda run: (run / "med" / "evaluation.json").write_text("{}")
     )
-    for changed, told in ({"score": -5.0}, "-5 in 200"), ({"episodes": 2}, "10.005 in 4"):
+    for changed, score in ({"score": -5.0}, "-5 in 200"), ({"episodes": 2}, "10.005 in 4"):
 
         def other(run, changed=changed):
             file = run / "med" / "evaluation.json"
-            file.write_text(json.dumps({name: own | changed for name, own in json.loads(file.read_text()).items()}))
+            file.write_text(json.dumps({name: result | changed for name, result in json.loads(file.read_text()).items()}))
 
-        what = f"force-hand-clean-s0, force-hand-clean-s1 score {told} episodes, 10.005 in 200 episodes by table.csv"
-        assert f"evaluation.json: {what}: of another evaluation" in refused(other)
+        message = f"force-hand-clean-s0, force-hand-clean-s1 score {score} episodes, 10.005 in 200 episodes by table.csv"
+        assert f"evaluation.json: {message}: of another evaluation" in refused(other)
     assert "this is no JSON" in refused(lambda run: (run / "med" / "run.json").write_text("{"))
     other = evaluation(tmp_path / "other.json", 1.0, "screwdriver")
     assert 'an evaluation in "screwdriver", expected one in "in_palm_rotate"' in refused(teacher=other)
@@ -313,15 +323,15 @@ def test_mistakes(tmp_path, capsys, monkeypatch):
     page = tmp_path / "page.md"
     page.write_text("# Nothing\n")
     monkeypatch.setattr(sys, "argv", ["ablations.py", "page", "--kept", str(tmp_path / "kept"), "--page", str(page)])
-    with pytest.raises(SystemExit) as ended:
+    with pytest.raises(SystemExit) as failure:
         ablations.main()
-    assert ended.value.code == 2 and f"{page}: expected the lines {BEGIN} and {END}" in capsys.readouterr().err
+    assert failure.value.code == 2 and f"{page}: expected the lines {BEGIN} and {END}" in capsys.readouterr().err
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 def test_a_run_of_tgdsl_distill_and_its_next_leg(tmp_path, here, no_onnx):
-    """A small task on the CPU, two resolutions: what the command writes is what is collected."""
+    """A small task on the CPU with two resolutions: collect what the command writes."""
     task = felt_task(tmp_path)
     sensors = (tmp_path / "sensors.yaml").read_text()
     dense = "      high:\n        tip: {method: grid, rows: 3, columns: 3, direction: [0, 0, 1], radius: 8 mm}\nobjects:"
@@ -329,8 +339,8 @@ def test_a_run_of_tgdsl_distill_and_its_next_leg(tmp_path, here, no_onnx):
     teacher(tmp_path / "teacher.pt", load_task(task), ["priv_proprio", "priv_obj_state"])
     small = [
         word
-        for own in ("steps=4", "networks.encoder.hidden=[8]", "networks.hidden=[8]")
-        for word in ("--set", f"distill.{own}")
+        for setting in ("steps=4", "networks.encoder.hidden=[8]", "networks.hidden=[8]")
+        for word in ("--set", f"distill.{setting}")
     ]
     taught = ("--teacher", str(tmp_path / "teacher.pt"), "--types", "depth,none", "--placements", "ends", "--seeds", "2")
     options = (
@@ -351,7 +361,7 @@ def test_a_run_of_tgdsl_distill_and_its_next_leg(tmp_path, here, no_onnx):
     assert code == 0, error
     collect(tmp_path / "run", "small", into=tmp_path / "kept")
     first = read_ablation(tmp_path / "kept" / "small")
-    assert [(own.row.type, own.row.resolution) for own in first.taught] == [
+    assert [(setting.row.type, setting.row.resolution) for setting in first.taught] == [
         ("depth", "low"),
         ("none", "low"),
         ("depth", "high"),

@@ -1,4 +1,4 @@
-"""`benchmarks/ablations.py collect`: curves that are kept, and the legs of a run."""
+"""`benchmarks/ablations.py collect`: thinned curves, and the legs of a run."""
 
 import csv
 import json
@@ -23,8 +23,8 @@ SCORES = {"force": lambda x: 10.0, "bool": lambda x: 8.0, "depth": lambda x: 9.9
 SCORES |= {"none": lambda x: 1.0}
 
 
-def test_a_score_does_not_count_by_the_episodes_of_others(tmp_path):
-    """The first one drops the object often at first: 99 of 100 episodes; the other one ends an episode, then nine."""
+def test_scores_are_not_weighted_by_episodes_of_other_students(tmp_path):
+    """At first, one student ends 99 of 100 episodes, the other one; then the other ends nine."""
     names = ["often-x-c-s0", "seldom-x-c-s0"]
     header = ["iteration", "samples", "seconds", "episodes", *(start + name for start in ("Score/", "Loss/") for name in names)]
     rows = (("1", "20", "1", "100", "5", "0", "1", "1"), ("2", "40", "2", "10", "5", "1", "1", "1"))
@@ -36,7 +36,7 @@ def test_a_score_does_not_count_by_the_episodes_of_others(tmp_path):
 
 @pytest.mark.parametrize("rows", [60, 15])
 def test_a_thinned_curve_changes_as_much_as_the_whole_one(tmp_path, rows):
-    """A straight line rises by a third of its rise over the last third, in however many points it is kept."""
+    """A straight line rises by a third over the last third, however many points remain."""
     run = made_up_run(tmp_path / "run", SCORES, seeds=1)
     collect(run, "thin", into=tmp_path / "kept", rows=rows)
     curves = read_ablation(tmp_path / "kept" / "thin").curves["med"]
@@ -44,37 +44,37 @@ def test_a_thinned_curve_changes_as_much_as_the_whole_one(tmp_path, rows):
     assert trend(curves.samples, curves.score["proximity-hand-clean-s0"]).change == pytest.approx(4.0 / 3.0, rel=5e-3)
 
 
-def started(run, *changes):
-    """Have a run's simulation be of other starts: each the first one but for some of its values and of its document's."""
+def set_starts(run, *changes):
+    """Replace the starts of a run by copies of the first with changed values and document."""
     file = run / "med" / "run.json"
     first = json.loads(file.read_text())["starts"][0]
-    starts = [first | own | {"spec": first["spec"] | spec} for own, spec in changes]
+    starts = [first | values | {"spec": first["spec"] | spec} for values, spec in changes]
     file.write_text(json.dumps({"starts": starts}))
 
 
-def test_starts_of_which_no_iteration_is_left_are_no_legs(tmp_path):
-    """One was killed after 250 iterations, its last checkpoint after 240; another one while it evaluated, after the last."""
+def test_starts_without_remaining_iterations_are_no_legs(tmp_path):
+    """One was killed after 250 iterations with its last checkpoint at 240, another during its evaluation."""
     run = made_up_run(tmp_path / "run", SCORES)
     starts = ((0, "a", (1e-3, 1e-4)), (240, "b", (5.0, None)), (240, "c", (1e-5, None)), (300, "d", (5.0, None)))
-    told = [{"learning_rate": first, "final_learning_rate": last, "steps": STEPS} for *_, (first, last) in starts]
-    started(
+    documents = [{"learning_rate": first, "final_learning_rate": last, "steps": STEPS} for *_, (first, last) in starts]
+    set_starts(
         run,
         *(
-            ({"iteration": first, "device": device}, {"distill": own})
-            for (first, device, _), own in zip(starts, told, strict=True)
+            ({"iteration": first, "device": device}, {"distill": document_part})
+            for (first, device, _), document_part in zip(starts, documents, strict=True)
         ),
     )
     collect(run, "legs", into=tmp_path / "kept")
-    made = read_ablation(tmp_path / "kept" / "legs").made["simulations"]["med"]
-    assert made["begun"] == list(LEGS) and made["devices"] == ["a", "c"]
-    how = "on a, c: 100 environments, 25.0 min in 2 legs, at rates of 0.001 falling to 0.0001 and then 1e-05. "
-    assert how in tables(tmp_path / "kept")
+    provenance = read_ablation(tmp_path / "kept" / "legs").made["simulations"]["med"]
+    assert provenance["begun"] == list(LEGS) and provenance["devices"] == ["a", "c"]
+    line = "on a, c: 100 environments, 25.0 min in 2 legs, at rates of 0.001 falling to 0.0001 and then 1e-05. "
+    assert line in tables(tmp_path / "kept")
 
 
-def test_what_is_part_of_an_episode_follows_from_its_own_leg(tmp_path):
-    """The second leg's episodes are a quarter as long: five iterations of it are left out, and 17 of the first one as before."""
+def test_partial_episodes_depend_on_their_leg(tmp_path):
+    """Episodes of the second leg are a quarter as long: five of its iterations are left out, and 17 of the first's."""
     run = made_up_run(tmp_path / "run", SCORES)
-    started(run, ({"iteration": 0}, {}), ({"iteration": 240}, {"episode": 2.5}))
+    set_starts(run, ({"iteration": 0}, {}), ({"iteration": 240}, {"episode": 2.5}))
     curve = run / "med" / "curve.csv"
     with curve.open(newline="") as file:
         rows = list(csv.DictReader(file))

@@ -14,15 +14,15 @@ from ablations_kept import KeptError
 from ablations_page import BEGIN, END, tables, write_page
 
 SCORES = {"cnn": lambda x: 8.0, "lstm": lambda x: 10.0, "mlp": lambda x: 4.0 * x, "rising": lambda x: 9.0 + 3.0 * x}
-"""Two that have levelled off, and two that rise: below both, and above both."""
+"""Two flat curves, and two that still rise: one below both, one above both."""
 
 
 @pytest.fixture
 def kept(tmp_path):
-    """Keep a run of `force` for each, as nets__NAME; return the folder of all that is kept."""
+    """Collect a run of `force` per curve, as nets__NAME; return the folder."""
     for who, score in (("teacher", 12.0), ("rest", 0.0)):
-        own = {"task": "in_palm_rotate", "score": score, "score_interval": [score, score], "held": 1.0}
-        (tmp_path / f"{who}.json").write_text(json.dumps(own))
+        content = {"task": "in_palm_rotate", "score": score, "score_interval": [score, score], "held": 1.0}
+        (tmp_path / f"{who}.json").write_text(json.dumps(content))
     for name, score in SCORES.items():
         overrides = {"distill.epochs": "12", "distill.networks.touch_kind": name}
         run = made_up_run(tmp_path / name, {"force": score}, overrides=overrides)
@@ -36,8 +36,8 @@ def test_runs_of_a_series_have_one_table(kept):
     rows = {line.split("`")[1]: line for line in text.splitlines() if line.startswith("| `")}
     assert list(rows) == list(SCORES) and text.count("| *teacher* |") == 1
     assert rows["cnn"].startswith("| `cnn`, `distill.networks.touch_kind=cnn` | `force` | hand, med, clean | 2 | 8.005 |")
-    told = {name: [part.strip() for part in row.split("|")[-3:-1]] for name, row in rows.items()}
-    assert told == {
+    verdicts = {name: [part.strip() for part in row.split("|")[-3:-1]] for name, row in rows.items()}
+    assert verdicts == {
         "cnn": ["yes", "`lstm`, `rising`; open: `mlp`"],
         "lstm": ["yes", "`rising`; open: `mlp`"],
         "mlp": ["no", "open"],
@@ -46,8 +46,8 @@ def test_runs_of_a_series_have_one_table(kept):
     assert all(len(line.split("|")) == len(rows["cnn"].split("|")) for line in text.splitlines() if line.startswith("| "))
 
 
-def test_of_runs_of_other_lengths_nothing_is_said(kept):
-    """What is flat after half as many control steps may be early."""
+def test_runs_of_other_lengths_are_not_compared(kept):
+    """A curve that is flat after half as many control steps may still rise."""
     folder = kept / "nets__cnn"
     steps = 300 * 24 * 10
     (folder / "table.csv").write_text((folder / "table.csv").read_text().replace(f",{steps},", f",{steps // 2},"))
@@ -56,7 +56,7 @@ def test_of_runs_of_other_lengths_nothing_is_said(kept):
     assert rows["lstm"].endswith("| yes | `rising`; open: `cnn`, `mlp` |")
 
 
-def test_a_name_that_sorts_in_between_does_not_part_a_series(kept, tmp_path):
+def test_a_name_that_sorts_in_between_does_not_split_a_series(kept, tmp_path):
     for name in ("nets2", "nets__0"):
         collect(made_up_run(tmp_path / name, {"force": lambda x: 7.0}), name, into=kept)
     assert [line for line in tables(kept).splitlines() if line.startswith("#")] == ["### nets2", "### nets"]

@@ -1,4 +1,4 @@
-"""The stiffness of contacts at rest, by which the load of squeezed objects depends on how many there are."""
+"""The stiffness of contacts at rest: the load of squeezed objects depends on how many there are."""
 
 import importlib
 import sys
@@ -35,6 +35,6 @@ def test_contacts_are_springs_in_parallel(impedance, count):
     assert depth("elliptic", impedance, count) == pytest.approx(expected, rel=1e-6)
 
 
-def test_those_of_the_pyramidal_cone_are_stiffer():
+def test_pyramidal_cones_are_stiffer():
     expected = depth("elliptic", 0.95, 1) * FRICTION**2 * (1 + FRICTION**2) / (2 * IMPRATIO)
     assert depth("pyramidal", 0.95, 1) == pytest.approx(expected, rel=1e-6)

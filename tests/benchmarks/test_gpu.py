@@ -1,4 +1,4 @@
-"""`benchmarks/gpu.py` without a GPU: its bytes, errors and limits by values worked out by hand, and a dry run."""
+"""`benchmarks/gpu.py` without a GPU: bytes, errors and limits against values by hand, and a dry run."""
 
 import json
 import sys
@@ -50,7 +50,7 @@ def module_of(name, tmp_path):
 
 
 class TestBytes:
-    def test_two_bodies_their_velocities_and_one_pair_make_six_numbers_of_100_taxels(self, tmp_path):
+    def test_two_bodies_and_one_pair_give_six_numbers_per_taxel(self, tmp_path):
         size = bytes_of(module_of("kinematic", tmp_path))
         assert size.inputs == 2 * (3 + 4 + 3 + 3) * 4 + 1
         assert size.outputs == 100 * 6 * 4
@@ -58,13 +58,13 @@ class TestBytes:
         assert size.moved == size.held == 105 + 2400
         assert size.per_taxel == 24.0
 
-    def test_noisy_carries_two_numbers_of_hysteresis_one_of_drift_and_two_counts(self, tmp_path):
+    def test_noise_keeps_hysteresis_drift_and_counts(self, tmp_path):
         size = bytes_of(module_of("kinematic-noisy", tmp_path))
         assert size.state == 100 * 6 * 3 * 4 + 2 * 8
         assert size.moved == 105 + 2400 + 2 * 7216
         assert size.per_taxel == 24 + 72 + 0.16
 
-    def test_a_ring_of_three_calls_is_held_whole_and_touched_at_three_entries(self, tmp_path):
+    def test_a_ring_of_three_calls_is_held_whole_and_accessed_at_three_entries(self, tmp_path):
         size = bytes_of(module_of("kinematic-full", tmp_path))
         assert (size.ring_calls, size.ring_entry) == (3, 2400)
         assert size.moved == 105 + 2400 + 2 * 7216 + 3 * 2400
@@ -78,10 +78,10 @@ class TestBytes:
         assert size.moved == 2 * (3 + 4) * 4 + 1 + 1200 + 2 * 8000
 
     def test_stacked_readings_are_refused(self, tmp_path):
-        described = document(CASES["depth"], tmp_path)
-        described["sensors"]["on_pad0"]["history"] = 3
+        description = document(CASES["depth"], tmp_path)
+        description["sensors"]["on_pad0"]["history"] = 3
         with pytest.raises(ValueError, match="expected sensors without `history`"):
-            bytes_of(tgdsl.compile(described))
+            bytes_of(tgdsl.compile(description))
 
 
 class TestLimits:
@@ -98,11 +98,11 @@ class TestLimits:
             ({"error": 2e-5}, "error 2.0e-05 > 1e-05"),
         ],
     )
-    def test_what_is_missed_is_said(self, changes, said):
+    def test_missed_limits_are_named(self, changes, said):
         row = replace(ROW, **changes)
         assert unmet(row, None) == [said] and judged(row, None) == f"no: {said}"
 
-    def test_six_times_less_than_the_rival(self):
+    def test_the_rival_must_take_six_times_longer(self):
         row = replace(ROW, case="kinematic-10-objects", graph=0.41 / 5)
         assert unmet(row, None) == ["5.0 times less than the rival's, not 6"]
         assert unmet(replace(row, graph=0.41 / 6.01), None) == []
@@ -114,12 +114,12 @@ class TestLimits:
         assert unmet(replace(row, graph=0.08), ROW) == ["3.20 × clean > 3 ×"]
         assert unmet(replace(row, per_taxel=121.0), ROW) == ["121.0 B per taxel > 120 B"]
 
-    def test_rows_without_a_limit_are_asked_for_error_and_bytes(self):
+    def test_rows_without_a_time_limit_are_checked_for_error_and_bytes(self):
         row = replace(ROW, num_envs=1_024, graph=9.0)
         assert judged(row, None) == "–"
         assert judged(replace(row, error=1.0), None).startswith("no: error")
 
-    def test_limits_are_of_cases_that_are_measured(self):
+    def test_every_limit_is_of_a_measured_case(self):
         assert all(num_envs in CASES[name].envs for name, num_envs in TARGETS)
 
     def test_rate_and_ratio(self):
@@ -139,19 +139,19 @@ class TestErrors:
 
     def errors(self, apart_s, apart_missed):
         want = {"s": np.array([[[4.0, 0.5], [-8.0, 0.0]]]), "s/missed": np.array([[[0.1]]])}
-        found = {"s": want["s"] + apart_s, "s/missed": want["s/missed"] + apart_missed}
-        return gpu.full_scale_errors(self.OUTPUTS, found, want)
+        readings = {"s": want["s"] + apart_s, "s/missed": want["s/missed"] + apart_missed}
+        return gpu.full_scale_errors(self.OUTPUTS, readings, want)
 
-    def test_each_channel_has_its_own_scale_and_a_remainder_that_of_its_unit(self):
-        found = self.errors([[[0.8, 0.1], [0.0, 0.0]]], [[[0.4]]])
-        assert found == pytest.approx([0.1, 0.2, 0, 0, 0.05])
+    def test_each_channel_has_its_own_scale_and_a_remainder_its_units(self):
+        errors = self.errors([[[0.8, 0.1], [0.0, 0.0]]], [[[0.4]]])
+        assert errors == pytest.approx([0.1, 0.2, 0, 0, 0.05])
 
-    def test_what_should_be_nothing_and_is_not_errs_without_bound(self):
+    def test_nonzero_readings_of_zero_have_infinite_errors(self):
         want = {"s": np.zeros((1, 1, 2)), "s/missed": np.zeros((1, 1, 1))}
-        found = {"s": np.array([[[1e-9, 0.0]]]), "s/missed": np.zeros((1, 1, 1))}
-        assert gpu.full_scale_errors(self.OUTPUTS, found, want).tolist() == [np.inf, 0, 0]
+        errors = {"s": np.array([[[1e-9, 0.0]]]), "s/missed": np.zeros((1, 1, 1))}
+        assert gpu.full_scale_errors(self.OUTPUTS, errors, want).tolist() == [np.inf, 0, 0]
 
-    def test_what_is_no_number_is_an_error(self):
+    def test_nan_is_refused(self):
         with pytest.raises(ValueError, match="s/missed is not finite"):
             self.errors(0.0, np.nan)
 
@@ -170,13 +170,13 @@ class TestGuard:
         lines, is_met = gpu.compared({"depth × 16,384": 2.0, "new × 8": 1.0}, {"depth × 16,384": 3.0})
         assert is_met and "-33%" in lines[0] and "nothing kept" in lines[1]
 
-    def test_nothing_kept_of_a_card_is_no_pass(self):
+    def test_a_card_without_kept_ratios_does_not_pass(self):
         assert not gpu.compared({"depth × 16,384": 2.0}, {})[1]
 
     def test_a_dry_run_keeps_ratios_and_compares_them(self, tmp_path, capsys, monkeypatch):
         make_artefacts(tmp_path / "art", [CASES["depth"]])
-        kept = tmp_path / "kept.json"
-        own = [
+        file = tmp_path / "kept.json"
+        arguments = [
             "--device",
             "cpu",
             "--eager",
@@ -191,12 +191,12 @@ class TestGuard:
             "--rows",
             "depth",
         ]
-        command = ["guard", str(tmp_path / "art"), "--out", str(tmp_path / "rows.json"), "--kept", str(kept), *own]
+        command = ["guard", str(tmp_path / "art"), "--out", str(tmp_path / "rows.json"), "--kept", str(file), *arguments]
         options = gpu.parsed([*command, "--keep"])
         with pytest.raises(SystemExit, match="0"):
             options.call(options)
-        assert list(json.loads(kept.read_text())["CPU"]) == ["depth × 3"]
-        kept.write_text('{"CPU": {"depth × 3": 1e-6}}')
+        assert list(json.loads(file.read_text())["CPU"]) == ["depth × 3"]
+        file.write_text('{"CPU": {"depth × 3": 1e-6}}')
         rows = (tmp_path / "rows.json").read_text()
         monkeypatch.setattr(gpu, "run", lambda options: options.out.write_text(rows))
         options = gpu.parsed(command)
@@ -211,7 +211,7 @@ def test_sets_exceed_the_cache():
     assert gpu.num_sets(1e3) == gpu.MOST_SETS
 
 
-def test_medians_leave_out_the_first_and_stop_when_it_takes_long():
+def test_medians_skip_the_first_call_and_stop_when_slow():
     times = iter([99.0, 3.0, 1.0, 2.0])
     assert gpu.median_of(lambda: next(times), 3) == 2.0
     long = iter([1.0, 600.0, 500.0, 700.0])
@@ -224,7 +224,7 @@ def test_every_call_of_a_batch_is_made():
     assert len(calls) == 5 * (1 + 3)
 
 
-def test_full_noise_gives_each_kind_the_knobs_that_it_has():
+def test_full_noise_sets_only_knobs_that_the_kind_has():
     assert noise_of(CASES["kinematic-full"]) == {"noise": EVERY_KNOB}
     assert "radius_noise" not in noise_of(CASES["link_contact-full"])["noise"]
     assert noise_of(CASES["kinematic"]) == {}
@@ -236,26 +236,37 @@ def test_part_of_the_taxels_feels_the_lowest_cube(tmp_path):
         state = state_of(touch, 64, 0)
         state.contact_found[:] = True
         felt = torch.cat([reading.ne(0).any(dim=-1) for reading in touch(state).values()], dim=1).double().mean()
-        assert (
-            0.3 < felt < 0.95
-        )  # the cube covers 4/9 of a pad, 2/3 where it goes on in one direction; probes reach 4 mm farther
+        assert 0.3 < felt < 0.95  # the cube covers 4/9 of a pad, or 2/3 if it extends past one side; probes reach 4 mm farther
 
 
 @pytest.mark.slow
 def test_a_dry_run_measures_writes_and_draws(tmp_path, capsys):
-    """Without an artefact a row fails, and the others go on."""
+    """A row without an artefact fails, and the others go on."""
     names, results = ["depth", "kinematic-noisy"], tmp_path / "gpu.json"
     make_artefacts(tmp_path / "art", [CASES[name] for name in names])
-    own = ["--device", "cpu", "--eager", "--sets", "2", "--repeats", "1", "--check-envs", "4", "--rows", "kinematic", *names]
-    options = gpu.parsed(["run", str(tmp_path / "art"), "--out", str(results), *own, "--envs", "3", "5"])
+    arguments = [
+        "--device",
+        "cpu",
+        "--eager",
+        "--sets",
+        "2",
+        "--repeats",
+        "1",
+        "--check-envs",
+        "4",
+        "--rows",
+        "kinematic",
+        *names,
+    ]
+    options = gpu.parsed(["run", str(tmp_path / "art"), "--out", str(results), *arguments, "--envs", "3", "5"])
     options.call(options)
-    said = capsys.readouterr().out
-    assert "kinematic: FAILED" in said and "kinematic.safetensors" in said
-    # A row that is measured again takes the place of the old one.
+    output = capsys.readouterr().out
+    assert "kinematic: FAILED" in output and "kinematic.safetensors" in output
+    # A row that is measured again replaces the old one.
     versions = {name: value for name, value in json.loads(results.read_text()).items() if name != "rows"}
     gpu.write(results, gpu_plots.load_rows([results])[0], versions)
-    kept = json.loads(results.read_text())
-    assert kept["device"] == "CPU"
+    content = json.loads(results.read_text())
+    assert content["device"] == "CPU"
     rows = gpu_plots.load_rows([results])
     assert sorted(row.key for row in rows) == [(name, num_envs) for name in names for num_envs in (3, 5)]
     for row in rows:
@@ -274,8 +285,8 @@ def test_a_dry_run_measures_writes_and_draws(tmp_path, capsys):
     assert sorted(path.name for path in (tmp_path / "images").iterdir()) == ["gpu_memory.png", "gpu_throughput.png"]
 
 
-def test_time_that_is_up_leaves_the_rest_and_says_so(tmp_path, capsys):
-    own = ["--device", "cpu", "--eager", "--minutes", "-1", "--rows", "depth", "kinematic"]
-    options = gpu.parsed(["run", str(tmp_path), "--out", str(tmp_path / "gpu.json"), *own])
+def test_rows_past_the_time_limit_are_named(tmp_path, capsys):
+    arguments = ["--device", "cpu", "--eager", "--minutes", "-1", "--rows", "depth", "kinematic"]
+    options = gpu.parsed(["run", str(tmp_path), "--out", str(tmp_path / "gpu.json"), *arguments])
     options.call(options)
     assert "not measured: depth kinematic" in capsys.readouterr().out

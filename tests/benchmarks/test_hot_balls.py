@@ -1,4 +1,4 @@
-"""`benchmarks/hot_balls.py`: documents of settings that say what they are to say, and the table of evaluations."""
+"""`benchmarks/hot_balls.py`: documents of each setting, and the table of evaluations."""
 
 import json
 import sys
@@ -15,8 +15,8 @@ from tgdsl.rl.load import load_task
 from tgdsl.schema.load import load
 
 
-def test_documents_differ_in_what_fingers_are_made_of(tmp_path):
-    """They stand anywhere: the scene is named by its place."""
+def test_documents_differ_in_the_material_of_fingers(tmp_path):
+    """They work in any folder, because they name the scene by its path."""
     files = hot_balls.documents(tmp_path / "made")
     assert [file.stem for file in files] == [setting.name for setting in hot_balls.SETTINGS]
     plain = load(hot_balls.TASKS / "bin.yaml").spec.sensors
@@ -24,8 +24,8 @@ def test_documents_differ_in_what_fingers_are_made_of(tmp_path):
         task = load_task(file)
         assert task.spec.train.actor == ("proprio", "tactile_sensors") and task.spec.touch == "temperature"
         sensors = load(file.with_name(task.spec.document)).spec.sensors
-        assert {name: own for name, own in sensors.items() if name != "heat"} == {
-            name: own for name, own in plain.items() if name != "heat"
+        assert {name: sensor for name, sensor in sensors.items() if name != "heat"} == {
+            name: sensor for name, sensor in plain.items() if name != "heat"
         }
         heat, material = sensors["heat"], sensors["heat"].material_of("right_hand_mid_link2")
         assert (material.conductivity, material.emissivity) == (setting.conductivity, setting.emissivity)
@@ -36,10 +36,10 @@ def test_documents_differ_in_what_fingers_are_made_of(tmp_path):
         assert heat.convection == (5.0 if is_physics else None)
 
 
-def test_the_table_has_what_was_evaluated_beside_the_papers_mark(tmp_path, capsys):
+def test_the_table_has_evaluations_and_the_papers_verdicts(tmp_path, capsys):
     def evaluation(name, score, task="hot_ball"):
-        found = {"task": task, "score": score, "score_interval": [score - 0.1, score + 0.1], "episodes": 1000}
-        (tmp_path / f"{name}.json").write_text(json.dumps(found))
+        content = {"task": task, "score": score, "score_interval": [score - 0.1, score + 0.1], "episodes": 1000}
+        (tmp_path / f"{name}.json").write_text(json.dumps(content))
 
     evaluation("physics_150_0.5", 3.0)
     evaluation("paper_10_0.5", 11.25)
@@ -63,6 +63,6 @@ def test_the_table_has_what_was_evaluated_beside_the_papers_mark(tmp_path, capsy
         (tmp_path / "list", "found a list, expected what tgdsl evaluate --out wrote"),
         (tmp_path / "lacking", "there is no episodes"),
     ):
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(SystemExit) as error:
             hot_balls.main(["table", str(folder)])
-        assert ended.value.code == 2 and message in capsys.readouterr().err
+        assert error.value.code == 2 and message in capsys.readouterr().err

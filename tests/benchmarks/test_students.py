@@ -20,28 +20,28 @@ SMALL = ("distill.steps=4", "distill.networks.encoder.hidden=[8]", "distill.netw
 
 @pytest.fixture
 def options(tmp_path):
-    """Arguments for the tiny task, whose sensors are those of all types."""
+    """Return arguments for the tiny task with sensors of all types."""
     task = write_task(tmp_path, more="distill: {decoders: {}}\n")
-    own = teacher(tmp_path / "teacher.pt", load_task(task), ["priv_proprio", "priv_obj_state"])
+    teacher_file = teacher(tmp_path / "teacher.pt", load_task(task), ["priv_proprio", "priv_obj_state"])
     small = ("--device", "cpu", "--warm", "1", "--iterations", "2", "--seeds", "3", "--type-seeds", "1")
-    return ["profile", str(task), "--teacher", str(own), *small, "--set", *SMALL]
+    return ["profile", str(task), "--teacher", str(teacher_file), *small, "--set", *SMALL]
 
 
 def test_all_parts_are_measured_and_written(options, tmp_path, capsys):
     students.main([*options, "--envs", "24", "--out", str(tmp_path / "found.json")])
-    found = json.loads((tmp_path / "found.json").read_text())
-    parts = found["parts"]
-    assert {name: (own["students"], own["stacks"]) for name, own in parts.items()} == {
+    report = json.loads((tmp_path / "found.json").read_text())
+    parts = report["parts"]
+    assert {name: (part["students"], part["stacks"]) for name, part in parts.items()} == {
         "one": (1, 1),
         "seeds": (3, 1),
         "types": (8, 5),
         "one_beside": (1, 1),
     }
-    for own in parts.values():
-        assert own["rollout_ms"] > 0 and own["update_ms"] > 0
-        assert own["ratio"] == pytest.approx(own["iteration_ms"] / parts["one"]["iteration_ms"], abs=1e-3)
-        assert own["iteration_spread_ms"][0] <= own["iteration_ms"] <= own["iteration_spread_ms"][1]
-    assert found["envs"] == 24 and found["steps"] == 4 and not found["once"]
+    for part in parts.values():
+        assert part["rollout_ms"] > 0 and part["update_ms"] > 0
+        assert part["ratio"] == pytest.approx(part["iteration_ms"] / parts["one"]["iteration_ms"], abs=1e-3)
+        assert part["iteration_spread_ms"][0] <= part["iteration_ms"] <= part["iteration_spread_ms"][1]
+    assert report["envs"] == 24 and report["steps"] == 4 and not report["once"]
     text = capsys.readouterr().out
     assert "seeds | 3 | 1 |" in text and "| 1.20" in text and "| 1.40" in text
 
@@ -52,11 +52,11 @@ def test_environments_made_once(options, tmp_path, capsys):
     assert capsys.readouterr().out.count("environments for") == 1
 
 
-def test_mistakes(options, capsys):
+def test_wrong_arguments_are_refused(options, capsys):
     for arguments, message in (
         (("--envs", "25"), "25 environments do not divide among 3 students: expected 24 or 27"),
         (("--envs", "24", "--types", "forces"), 'there is no type "forces"; did you mean "force"'),
     ):
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(SystemExit) as error:
             students.main([*options, *arguments])
-        assert ended.value.code == 2 and message in capsys.readouterr().err
+        assert error.value.code == 2 and message in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""`benchmarks/training_curves.py`: what is kept of the curve of a run."""
+"""`benchmarks/training_curves.py`: curves of runs, thinned."""
 
 import csv
 import sys
@@ -13,7 +13,7 @@ from ablations_kept import KeptError
 
 
 def test_a_curve_is_thinned_to_means_over_equal_numbers_of_iterations(tmp_path, monkeypatch):
-    """Of episodes' values those over episodes, where there were any; what counts on is that of the last iteration."""
+    """Values of episodes are weighted by episodes; counters have the last iteration's value."""
     monkeypatch.setattr(training_curves, "KEPT", tmp_path / "kept")
     num = 2 * training_curves.ROWS
     with (tmp_path / "curve.csv").open("w", newline="") as file:
@@ -24,9 +24,9 @@ def test_a_curve_is_thinned_to_means_over_equal_numbers_of_iterations(tmp_path, 
         for i in range(num):
             score = "nan" if i < 2 else i
             writer.writerow([i + 1, 100 * (i + 1), 0.5 * (i + 1), 0 if i < 2 else 1 + 2 * (i % 2), score, i, 3 * i, i, 2 * i])
-    found = training_curves.keep(tmp_path, "task/run")
-    assert found == tmp_path / "kept" / "task" / "run.csv"
-    with found.open(newline="") as file:
+    file_kept = training_curves.keep(tmp_path, "task/run")
+    assert file_kept == tmp_path / "kept" / "task" / "run.csv"
+    with file_kept.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == training_curves.ROWS
     assert rows[0] == {
@@ -37,7 +37,7 @@ def test_a_curve_is_thinned_to_means_over_equal_numbers_of_iterations(tmp_path, 
     assert rows[4]["rollout"] == "8.5"
 
 
-def test_no_curve_or_none_of_a_run_leaves_what_was_kept(tmp_path, monkeypatch):
+def test_a_missing_or_invalid_curve_leaves_the_kept_one(tmp_path, monkeypatch):
     monkeypatch.setattr(training_curves, "KEPT", tmp_path)
     (tmp_path / "run.csv").write_text("kept")
     for text, message in ((None, r"curve\.csv: cannot read this file"), ("iteration,seconds\n1,2\n", "no column episodes")):

@@ -1,4 +1,4 @@
-"""`benchmarks/turns.py`: processes that take turns, by what small scripts of the same options do and print."""
+"""`benchmarks/turns.py`: small scripts with the same options take turns."""
 
 import argparse
 import fcntl
@@ -36,19 +36,19 @@ options.out.write_text(f"{{start}} {{time.monotonic()}}")
 """
 
 
-def ended(folder, cases, *arguments):
-    """Run the script for each case; return what was printed and what was written, in the order in which processes ended."""
+def run_cases(folder, cases, *arguments):
+    """Run the script for each case; return case, output and written file, in the order in which processes ended."""
     script = folder / "script.py"
     script.write_text(SCRIPT)
     parser = argparse.ArgumentParser()
     turns.add_options(parser)
     options = parser.parse_args([*arguments], argparse.Namespace(arguments=[str(script), *arguments]))
-    found = turns.children(options, ["--case"], [(case,) for case in cases])
-    return [(case, said, out.read_text() if out.exists() else None) for (case,), said, out in found]
+    results = turns.children(options, ["--case"], [(case,) for case in cases])
+    return [(case, output, out.read_text() if out.exists() else None) for (case,), output, out in results]
 
 
 def is_free(path):
-    """Return whether another one could take its turn at once."""
+    """Return whether another process could take its turn at once."""
     with path.open("a") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -58,37 +58,37 @@ def is_free(path):
 
 
 @pytest.mark.slow
-def test_of_processes_at_once_each_has_the_turn_until_it_ends(tmp_path):
-    found = ended(tmp_path, ["a", "b"], "--jobs", "2", "--turn", str(tmp_path / "turn"))
-    assert sorted((case, said) for case, said, _ in found) == [("a", "a\n"), ("b", "b\n")]
-    (_, end), (start, _) = sorted(tuple(map(float, written.split())) for _, _, written in found)
+def test_parallel_processes_hold_the_turn_until_they_end(tmp_path):
+    results = run_cases(tmp_path, ["a", "b"], "--jobs", "2", "--turn", str(tmp_path / "turn"))
+    assert sorted((case, output) for case, output, _ in results) == [("a", "a\n"), ("b", "b\n")]
+    (_, end), (start, _) = sorted(tuple(map(float, written.split())) for _, _, written in results)
     assert end <= start
     assert (tmp_path / "turn").exists() and is_free(tmp_path / "turn")
 
 
 @pytest.mark.slow
-def test_one_that_fails_is_said_and_the_others_go_on(tmp_path):
-    (broken, said, written), (other, _, _) = ended(tmp_path, ["broken", "a"])
-    assert (broken, said, written) == ("broken", "broken\nbroken: FAILED, exit status 1\nno such thing\n", None)
+def test_a_failure_is_reported_and_the_others_go_on(tmp_path):
+    (broken, output, written), (other, _, _) = run_cases(tmp_path, ["broken", "a"])
+    assert (broken, output, written) == ("broken", "broken\nbroken: FAILED, exit status 1\nno such thing\n", None)
     assert other == "a"
 
 
-def test_when_the_time_is_up_nothing_begins(tmp_path):
+def test_no_case_starts_after_the_time_limit(tmp_path):
     start = time.perf_counter()
-    assert ended(tmp_path, ["a", "b"], "--minutes", "-1") == [("a", None, None), ("b", None, None)]
+    assert run_cases(tmp_path, ["a", "b"], "--minutes", "-1") == [("a", None, None), ("b", None, None)]
     assert time.perf_counter() - start < 1.0
 
 
 @pytest.mark.slow
-def test_the_turn_is_given_back_to_compile_and_taken_when_code_that_is_that_of_compile_runs(tmp_path, monkeypatch):
+def test_the_turn_is_free_while_compiling_and_taken_to_run(tmp_path, monkeypatch):
     from torch._inductor import compile_fx
 
-    touch, own = (tgdsl.compile(document(CASES["depth"], tmp_path)) for _ in range(2))
+    touch, reference = (tgdsl.compile(document(CASES["depth"], tmp_path)) for _ in range(2))
     path, compiled = tmp_path / "turn", []
-    whole = compile_fx.compile_fx
+    original = compile_fx.compile_fx
 
     def watched(*arguments, config_patches=None, **options):
-        call = whole(*arguments, config_patches=config_patches, **options)
+        call = original(*arguments, config_patches=config_patches, **options)
         if config_patches:
             compiled.append((is_free(path), config_patches))
         return call
@@ -102,9 +102,9 @@ def test_the_turn_is_given_back_to_compile_and_taken_when_code_that_is_that_of_c
     turn.compile(touch)
     with torch.no_grad():
         assert is_free(path)
-        found = touch(state)
+        readings = touch(state)
         assert not is_free(path)
-        expected = own.compile()(state)
+        expected = reference.compile()(state)
     (was_free, options), (_, expected_options) = compiled
     assert was_free and options == expected_options
-    assert all(torch.equal(found[name], expected[name]) for name in expected)
+    assert all(torch.equal(readings[name], expected[name]) for name in expected)

@@ -19,7 +19,7 @@ from tgdsl.surfaces.surface import Surface
 MARGIN, TOLERANCE = 0.004, 2e-4
 COARSE = 1e-3
 SLACK = 1.15
-"""On the tolerance, for a percentile of as few points as here."""
+"""Factor on the tolerance, for percentiles of few points."""
 
 
 @pytest.fixture(autouse=True)
@@ -30,10 +30,10 @@ def cache(tmp_path, monkeypatch) -> Path:
 
 @pytest.fixture
 def calls(monkeypatch) -> list[int]:
-    """Numbers of points that libigl's winding number was asked for."""
-    found, real = [], igl.fast_winding_number
-    monkeypatch.setattr(igl, "fast_winding_number", lambda v, f, pos: (found.append(len(pos)), real(v, f, pos))[1])
-    return found
+    """Return the list of numbers of points of each call of libigl's winding number."""
+    result, real = [], igl.fast_winding_number
+    monkeypatch.setattr(igl, "fast_winding_number", lambda v, f, pos: (result.append(len(pos)), real(v, f, pos))[1])
+    return result
 
 
 def rounded_cube(half: float = 0.02, radius: float = 0.004) -> trimesh.Trimesh:
@@ -48,11 +48,13 @@ def ask(baked: Baked, pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def around(surface: Surface, count: int = 3000, width: float = MARGIN, seed: int = 7) -> np.ndarray:
-    """Points around a surface, of another draw than the compiler's."""
+    """Return points around a surface, other than the compiler's."""
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     on_surface, _ = trimesh.sample.sample_surface(mesh, count, seed=seed)
-    way = np.random.default_rng(seed).normal(size=(count, 3))
-    return on_surface + width * way / np.linalg.norm(way, axis=1, keepdims=True) * np.linspace(0, 1, count)[:, None] ** (1 / 3)
+    direction = np.random.default_rng(seed).normal(size=(count, 3))
+    return on_surface + width * direction / np.linalg.norm(direction, axis=1, keepdims=True) * np.linspace(0, 1, count)[
+        :, None
+    ] ** (1 / 3)
 
 
 def box_distance(pos: np.ndarray, half: tuple[float, float, float]) -> np.ndarray:
@@ -61,8 +63,8 @@ def box_distance(pos: np.ndarray, half: tuple[float, float, float]) -> np.ndarra
 
 
 def check(baked: Baked, pos: np.ndarray, distance: np.ndarray, tolerance: float = TOLERANCE) -> None:
-    found, gradient = ask(baked, pos)
-    assert np.percentile(np.abs(found - distance), 99) <= SLACK * tolerance
+    result, gradient = ask(baked, pos)
+    assert np.percentile(np.abs(result - distance), 99) <= SLACK * tolerance
     assert baked.errors.p99 <= tolerance
     assert baked.errors.rms <= baked.errors.max and baked.errors.count > 1000
     np.testing.assert_allclose(np.linalg.norm(gradient, axis=1), 1.0, atol=1e-9)
@@ -84,7 +86,7 @@ def test_a_sphere_holds_the_tolerance():
     surface = surface_of(ball(0.02, at=(0.1, 0, 0)))
     baked = bake(surface, MARGIN, TOLERANCE)
     pos = around(surface)
-    # 40 µm: how far the middles of 5,120 facets lie inside the sphere.
+    # The centres of 5,120 facets lie up to 40 µm inside the sphere.
     check(baked, pos, np.linalg.norm(pos - [0.1, 0, 0], axis=1) - 0.02, TOLERANCE + 4e-5)
     assert baked.errors.edge_count == 0 and baked.errors.edge_max == 0
 
@@ -101,8 +103,8 @@ def test_a_rounded_cube_holds_the_tolerance():
 def test_a_thin_plate_has_two_sides():
     surface, half = surface_of(box((0.02, 0.02, 0.0008))), (0.01, 0.01, 0.0004)
     baked = bake(surface, 0.002, TOLERANCE)
-    found, gradient = ask(baked, np.array([[0, 0, 0.001], [0, 0, -0.001], [0.003, 0, 0.0004], [0.003, 0.001, 0]]))
-    np.testing.assert_allclose(found, [6e-4, 6e-4, 0, -4e-4], atol=1.5 * TOLERANCE)
+    result, gradient = ask(baked, np.array([[0, 0, 0.001], [0, 0, -0.001], [0.003, 0, 0.0004], [0.003, 0.001, 0]]))
+    np.testing.assert_allclose(result, [6e-4, 6e-4, 0, -4e-4], atol=1.5 * TOLERANCE)
     np.testing.assert_allclose(gradient[:2], [[0, 0, 1], [0, 0, -1]], atol=1e-3)
     pos = around(surface, width=0.002)
     pos = pos[np.abs(pos[:, :2]).max(axis=1) < 0.008]
@@ -125,7 +127,7 @@ def test_needles_and_degenerate_triangles_change_nothing():
     check(baked, pos, box_distance(pos, (0.015,) * 3), 2 * TOLERANCE)
 
 
-def test_a_missing_face_gets_a_lid():
+def test_a_missing_face_is_capped():
     mesh = box((0.03, 0.03, 0.03))
     is_top = mesh.face_normals[:, 2] > 0.5
     mesh.update_faces(~is_top)
@@ -136,8 +138,8 @@ def test_a_missing_face_gets_a_lid():
 
 def test_an_open_sheet_has_no_inside():
     baked = bake(surface_of(plate(np.array([0, 0, 1.0]))), 0.002, TOLERANCE)
-    found, _ = ask(baked, np.array([[0, 0, 0.001], [0, 0, -0.001], [0.012, 0, 0]]))
-    np.testing.assert_allclose(found, [0.001, 0.001, 0.002], atol=1.5 * TOLERANCE)
+    result, _ = ask(baked, np.array([[0, 0, 0.001], [0, 0, -0.001], [0.012, 0, 0]]))
+    np.testing.assert_allclose(result, [0.001, 0.001, 0.002], atol=1.5 * TOLERANCE)
     assert baked.flaws == (OPEN,)
 
 
@@ -147,16 +149,16 @@ def test_an_inner_shell_is_solid_and_a_flipped_one_a_cavity(is_flipped):
     if is_flipped:
         inner.invert()
     baked = bake(surface_of(ball(0.02), inner), MARGIN, TOLERANCE)
-    found, _ = ask(baked, np.array([[0.011, 0, 0], [0, 0, 0.009], [0.0225, 0, 0]]))
+    result, _ = ask(baked, np.array([[0.011, 0, 0], [0, 0, 0.009], [0.0225, 0, 0]]))
     expected = [-0.001, 0.001, 0.0025] if is_flipped else [-0.009, -0.011, 0.0025]
-    np.testing.assert_allclose(found, expected, atol=3e-4)
+    np.testing.assert_allclose(result, expected, atol=3e-4)
 
 
 def test_overlapping_parts_make_one_solid():
-    """Surfaces inside do not count: in the bar, the nearest surface is the rim of the hole that it leaves in the box."""
+    """Inner surfaces do not count: inside the bar, the nearest surface is where it leaves the box."""
     baked = bake(surface_of(box((0.02, 0.02, 0.02)), box((0.004, 0.004, 0.05))), MARGIN, TOLERANCE)
-    found, _ = ask(baked, np.array([[0, 0, 0.001], [0.002, 0, 0], [0.0, 0.0, 0.02], [0.004, 0, 0.02]]))
-    np.testing.assert_allclose(found, [-np.hypot(0.009, 0.002), -0.008, -0.002, 0.002], atol=1.5 * TOLERANCE)
+    result, _ = ask(baked, np.array([[0, 0, 0.001], [0.002, 0, 0], [0.0, 0.0, 0.02], [0.004, 0, 0.02]]))
+    np.testing.assert_allclose(result, [-np.hypot(0.009, 0.002), -0.008, -0.002, 0.002], atol=1.5 * TOLERANCE)
 
 
 def test_an_inverted_mesh_is_the_same_solid():
@@ -167,8 +169,8 @@ def test_an_inverted_mesh_is_the_same_solid():
     assert np.percentile(np.abs(ask(inverted, pos)[0] - ask(plain, pos)[0]), 98) < 2 * TOLERANCE
 
 
-def test_units_scale():
-    """A mesh in millimetres, baked with all lengths in millimetres, is the same but for its scale."""
+def test_baking_scales_with_units():
+    """Baking with all lengths in millimetres gives the same grid, scaled."""
     metres, millimetres = (
         bake(surface_of(box(tuple(k * np.array([0.03, 0.02, 0.01])))), k * MARGIN, k * TOLERANCE) for k in (1, 1e3)
     )
@@ -179,12 +181,12 @@ def test_units_scale():
 def test_far_points_read_far():
     baked = bake(surface_of(box((0.02, 0.02, 0.02))), MARGIN, TOLERANCE)
     pos = np.random.default_rng(0).normal(size=(500, 3)) * 0.3
-    true = box_distance(pos, (0.01,) * 3)
-    assert (ask(baked, pos)[0] >= np.where(true > MARGIN, MARGIN, true - TOLERANCE)).all()
+    expected = box_distance(pos, (0.01,) * 3)
+    assert (ask(baked, pos)[0] >= np.where(expected > MARGIN, MARGIN, expected - TOLERANCE)).all()
 
 
-def test_the_first_grid_that_is_tried_has_sixteen_cells_along_the_longest_side():
-    """Where it is good enough it is the one: of a ball of 4 cm and 4 mm around it, 3 mm."""
+def test_the_coarsest_grid_has_sixteen_cells_along_the_longest_side():
+    """A ball of 4 cm with a margin of 4 mm gets cells of 3 mm."""
     baked = bake(surface_of(ball(0.02, subdivisions=3)), MARGIN, 0.01)
     assert baked.cell == pytest.approx(0.048 / 16, rel=1e-12)
 
@@ -235,7 +237,7 @@ def test_without_a_writable_cache_it_works(monkeypatch, tmp_path):
     assert bake(surface_of(box((0.02, 0.02, 0.02))), MARGIN, COARSE).errors.p99 <= COARSE
 
 
-def test_where_the_cache_is(monkeypatch):
+def test_the_cache_folder_follows_the_environment(monkeypatch):
     assert where.folder() == Path(os.environ["TGDSL_CACHE"])
     monkeypatch.delenv("TGDSL_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", "/there")
@@ -246,15 +248,15 @@ def test_where_the_cache_is(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_same_every_time(monkeypatch, tmp_path):
-    found = []
+def test_baking_is_repeatable(monkeypatch, tmp_path):
+    result = []
     for name in "ab":
         monkeypatch.setenv("TGDSL_CACHE", str(tmp_path / name))
-        found.append(bake(surface_of(ball(0.02, subdivisions=3)), MARGIN, 4e-4))
-    assert found[0].values.tobytes() == found[1].values.tobytes() and found[0].errors == found[1].errors
+        result.append(bake(surface_of(ball(0.02, subdivisions=3)), MARGIN, 4e-4))
+    assert result[0].values.tobytes() == result[1].values.tobytes() and result[0].errors == result[1].errors
 
 
-def test_the_budget_is_kept():
+def test_a_grid_over_its_budget_is_refused():
     surface = surface_of(box((0.02, 0.02, 0.02)))
     with pytest.raises(BakeError) as caught:
         bake(surface, MARGIN, 1e-6, budget=2**20)
@@ -264,7 +266,7 @@ def test_the_budget_is_kept():
     assert int(text.split("(")[1].split()[0]) > 2**20
 
 
-def test_what_cannot_be_baked():
+def test_surfaces_that_cannot_be_baked_are_refused():
     surface = surface_of(box((0.02, 0.02, 0.02)))
     flat = Surface(surface.vertices, np.array([[0, 0, 1]]), np.zeros(1, int), surface.geoms)
     for wrong, margin, tolerance in (

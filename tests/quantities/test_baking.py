@@ -1,4 +1,4 @@
-"""What is said of meshes that are felt otherwise than they look."""
+"""Warnings about meshes that differ from what the sensors feel."""
 
 import warnings
 
@@ -15,7 +15,7 @@ GEOM = Geom(0, "", "cup", "item", "mesh", np.ones(3), np.zeros(3), np.eye(3), Tr
 RAYCAST = DistanceOptions(query="raycast")
 
 
-def test_a_mesh_that_is_not_closed_is_baked_with_a_warning(monkeypatch, tmp_path):
+def test_an_open_mesh_is_baked_with_a_warning(monkeypatch, tmp_path):
     monkeypatch.setenv("TGDSL_CACHE", str(tmp_path))
     cup, coarse = box((0.02, 0.02, 0.02)), DistanceOptions(tolerance=2e-3)
     with warnings.catch_warnings():
@@ -28,7 +28,7 @@ def test_a_mesh_that_is_not_closed_is_baked_with_a_warning(monkeypatch, tmp_path
         geom_distance(SurfaceGeom(GEOM, surface_of(cup)), coarse, 0.004, "object item")
 
 
-def test_a_hull_is_told_of_where_it_stands_off_by_more_than_probes_reach():
+def test_a_hull_farther_from_its_mesh_than_probes_reach_warns():
     """Two cubes of 1 cm, 2 cm apart: in the middle their hull is 1 cm from both."""
     cubes = [box((0.01, 0.01, 0.01), (x, 0, 0)) for x in (-0.015, 0.015)]
     hull = trimesh.util.concatenate(cubes).convex_hull
@@ -36,8 +36,8 @@ def test_a_hull_is_told_of_where_it_stands_off_by_more_than_probes_reach():
     with pytest.warns(
         UserWarning, match=r'^object item: MuJoCo collides the convex hull of geom "cup", up to (9\.9|10\.0) mm off'
     ):
-        found = geom_distance(felt, RAYCAST, 0.0095, "object item")
+        distance = geom_distance(felt, RAYCAST, 0.0095, "object item")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         geom_distance(felt, RAYCAST, 0.0101, "object item")
-    assert found.shape == "raycast" and found.arrays["max_distance"] == 2 * 0.0095
+    assert distance.shape == "raycast" and distance.arrays["max_distance"] == 2 * 0.0095

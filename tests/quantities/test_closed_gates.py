@@ -1,4 +1,4 @@
-"""Where no pair is in contact, depths behind gates are not measured on a CPU: what is read is the same, to the last bit."""
+"""Without contacts, depths behind gates are not measured on a CPU; readings are the same to the last bit."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ GATED = {
     "rough": {"kind": "contact_depth", "noise": {"radius_noise": "1 mm"}},
 }
 OPEN = {
-    "skin": {"kind": "elastomer"},  # where the objects are, not only how deep
+    "skin": {"kind": "elastomer"},  # reads positions of objects too
     "near": {"kind": "contact_depth", "gate": "geometric"},
     "gap": {"kind": "surface_distance", "max_range": "5 cm"},
 }
@@ -35,32 +35,34 @@ OPEN = {
 
 @pytest.fixture(scope="module")
 def modules(tmp_path_factory):
-    """Modules by the sensors that they have."""
+    """Return modules by the names of their sets of sensors."""
     folder = tmp_path_factory.mktemp("pad")
     feels = {"feels": ["item", "cube"]}
     return {
-        name: compiled(folder, ITEMS, OBJECTS, {own: sensor | feels for own, sensor in sensors.items()}, pad=PAD)
+        name: compiled(
+            folder, ITEMS, OBJECTS, {sensor_name: sensor | feels for sensor_name, sensor in sensors.items()}, pad=PAD
+        )
         for name, sensors in (("gated", GATED), ("all", GATED | OPEN))
     }
 
 
 def closed_state(touch, num_envs=5, dtype=torch.float64):
-    """Return bodies that lie within one another, which the simulator does not have in contact."""
+    """Return a state of overlapping bodies without contacts."""
     state = example_state(touch.inputs, num_envs, 0, dtype, 0.02)
     state.contact_found = torch.zeros_like(state.contact_found)
-    state.body_pos[1], state.body_quat[1] = 0.0, torch.tensor([1.0, 0, 0, 0], dtype=dtype)  # deep in one another
+    state.body_pos[1], state.body_quat[1] = 0.0, torch.tensor([1.0, 0, 0, 0], dtype=dtype)  # overlapping deeply
     return state
 
 
 def bits(touch, state):
-    """Return all readings, bit for bit, of a module that begins again."""
+    """Return all readings of a restarted module as bytes."""
     touch.free()
     with torch.no_grad():
         return {name: (value.shape, value.contiguous().numpy().tobytes()) for name, value in touch(state).items()}
 
 
 def measured(monkeypatch, touch, state):
-    """Return the readings with and without a look at the gates, and how many queries were measured with it."""
+    """Return the readings with and without a check of the gates, and how many queries the check left."""
     calls, measure = [], contact_depth.measure
 
     def counted(*args):
@@ -69,21 +71,21 @@ def measured(monkeypatch, touch, state):
 
     with monkeypatch.context() as patch:
         patch.setattr(contact_depth, "measure", counted)
-        found = bits(touch, state)
+        checked = bits(touch, state)
         num = len(calls)
         patch.setattr(contact_depth, "_are_closed", lambda scene: False)
-        return found, bits(touch, state), num
+        return checked, bits(touch, state), num
 
 
 @pytest.mark.parametrize("which", ["gated", "all"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_readings_are_the_same_and_gated_depths_are_not_measured(modules, monkeypatch, which, dtype):
+def test_gated_depths_are_skipped_without_changing_readings(modules, monkeypatch, which, dtype):
     touch = modules[which].to(dtype)
-    found, wanted, num = measured(monkeypatch, touch, closed_state(touch))
-    assert found == wanted and num == (0 if which == "gated" else 1)
-    assert np.frombuffer(found["force"][1], dtype=str(dtype).removeprefix("torch.")).max() == 0.0
-    found, wanted, num = measured(monkeypatch, touch, closed_state(touch, dtype=torch.float32))
-    assert found == wanted and num == (0 if which == "gated" else 1)
+    checked, unchecked, num = measured(monkeypatch, touch, closed_state(touch))
+    assert checked == unchecked and num == (0 if which == "gated" else 1)
+    assert np.frombuffer(checked["force"][1], dtype=str(dtype).removeprefix("torch.")).max() == 0.0
+    checked, unchecked, num = measured(monkeypatch, touch, closed_state(touch, dtype=torch.float32))
+    assert checked == unchecked and num == (0 if which == "gated" else 1)
 
 
 @pytest.mark.parametrize(
@@ -103,18 +105,18 @@ def test_readings_are_the_same_and_gated_depths_are_not_measured(modules, monkey
 )
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.filterwarnings("ignore:poses of bodies are not finite")
-def test_one_contact_or_one_number_that_is_none_and_all_is_measured(modules, monkeypatch, field, place, value, dtype):
+def test_one_contact_or_invalid_number_makes_all_depths_measured(modules, monkeypatch, field, place, value, dtype):
     touch = modules["gated"].to(dtype)
     state = closed_state(touch)
     state.contact_found = state.contact_found.double()
     getattr(state, field)[place] = value
-    found, wanted, num = measured(monkeypatch, touch, state)
-    assert found == wanted and num > 0
-    assert (found != bits(touch, closed_state(touch))) == (value != 1e25 or dtype == torch.float32)
+    checked, unchecked, num = measured(monkeypatch, touch, state)
+    assert checked == unchecked and num > 0
+    assert (checked != bits(touch, closed_state(touch))) == (value != 1e25 or dtype == torch.float32)
 
 
-def test_some_environments_of_many(modules, monkeypatch):
-    """As after resets: those alone are read, and none of them is in contact, while others are."""
+def test_masked_environments_read_the_same(modules, monkeypatch):
+    """As after resets: the masked environments have no contacts, but others do."""
     touch, mask = modules["gated"].double(), torch.tensor([False, True, False, False, True, False])
     state = closed_state(touch, 6)
     state.contact_found[0] = True
@@ -130,8 +132,7 @@ def test_some_environments_of_many(modules, monkeypatch):
     assert readings[0] == readings[1]
 
 
-def test_derivatives_are_those_of_what_is_measured(modules):
-    """Behind closed gates all are zero, and there are some."""
+def test_derivatives_behind_closed_gates_are_zero(modules):
     touch = modules["gated"].double()
     state = closed_state(touch)
     state.body_pos.requires_grad_(True)

@@ -9,24 +9,24 @@ from tgdsl.quantities.contacts import contacts_of, pair_contacts
 
 
 @pytest.mark.parametrize("component", range(10))
-def test_any_number_of_a_force_a_torque_or_a_normal_makes_a_contact(component):
-    """One of nine is not zero, or none: then there is no contact, and its place means nothing."""
-    told = torch.zeros(10, dtype=torch.float64)
-    told[component] = 0.5
-    force, torque, normal = told[:9].reshape(3, 1, 1, 1, 3)
-    place, zero = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64), torch.zeros(1, 1, 3, dtype=torch.float64)
+def test_any_nonzero_force_torque_or_normal_makes_a_contact(component):
+    """If all nine components are zero, there is no contact and its position is ignored."""
+    components = torch.zeros(10, dtype=torch.float64)
+    components[component] = 0.5
+    force, torque, normal = components[:9].reshape(3, 1, 1, 1, 3)
+    position, zero = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64), torch.zeros(1, 1, 3, dtype=torch.float64)
     state = {"contact_force": force, "contact_torque": torque, "contact_normal": normal, "contact_netforce": force[:, :, 0]}
-    state |= {"contact_pos": place.expand(1, 1, 1, 3), "body_pos": zero, "body_quat": torch.eye(4)[None, :1].double()}
-    found = contacts_of(state, torch.tensor([0]), torch.tensor([[0]]), torch.float64)
+    state |= {"contact_pos": position.expand(1, 1, 1, 3), "body_pos": zero, "body_quat": torch.eye(4)[None, :1].double()}
+    contacts = contacts_of(state, torch.tensor([0]), torch.tensor([[0]]), torch.float64)
     is_contact, has_normal = component < 9, 6 <= component < 9
-    assert torch.cat(found.pos).flatten().tolist() == (place.tolist() if is_contact else [0, 0, 0])
-    assert torch.cat(found.normal).isnan().all() == (is_contact and not has_normal)
+    assert torch.cat(contacts.pos).flatten().tolist() == (position.tolist() if is_contact else [0, 0, 0])
+    assert torch.cat(contacts.normal).isnan().all() == (is_contact and not has_normal)
     of_pairs = pair_contacts(state, torch.tensor([[0]]))
     assert of_pairs.is_used.item() == (component in (0, 1, 2, 6, 7, 8))
 
 
-def test_contacts_are_read_if_any_sensor_wants_them(tmp_path):
-    """One sensor asks for the net force of one ball, the other for the contacts with another: their forces, 1 N each."""
+def test_contacts_are_read_if_any_sensor_needs_them(tmp_path):
+    """One sensor reads the net force of one ball, the other the contacts with another: 1 N each."""
     bodies = "".join(f'<body name="{name}"><freejoint/><geom size=".02"/></body>' for name in ("one", "two"))
     sensors = {
         "net": {"kind": "link_contact", "outputs": ["force"], "feels": ["one"]},

@@ -5,21 +5,21 @@ import numpy as np
 from tgdsl.quantities.geoms import ReferenceGeom, distance_to
 
 TURNED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-"""By a quarter about z."""
+"""A quarter turn about z."""
 
 
-def test_the_nearest_of_two_geoms_counts_and_the_first_among_equals():
-    """A ball of 1 cm about the origin, and a turned box whose wall of 2 cm by 2 cm is at x = 3 cm."""
+def test_the_nearest_geom_counts_and_the_first_of_equals():
+    """A ball of 1 cm at the origin, and a rotated box with a wall at x = 3 cm."""
     ball = ReferenceGeom("sphere", np.array([0.01, 0, 0]), np.zeros(3), np.eye(3))
     box = ReferenceGeom("box", np.array([0.01, 0.02, 0.01]), np.array([0.05, 0, 0]), TURNED)
     for x, distance, outward in ((0.015, 0.005, 1), (0.026, 0.004, -1), (0.032, -0.002, -1)):
-        found, gradient = distance_to([ball, box], np.array([x, 0, 0]))
-        np.testing.assert_allclose([found, *gradient], [distance, outward, 0, 0], atol=1e-15)
+        measured, gradient = distance_to([ball, box], np.array([x, 0, 0]))
+        np.testing.assert_allclose([measured, *gradient], [distance, outward, 0, 0], atol=1e-15)
     for geoms, outward in (([ball, box], 1), ([box, ball], -1)):
-        found, gradient = distance_to(geoms, np.array([0.02, 0, 0]))
-        np.testing.assert_allclose([found, *gradient], [0.01, outward, 0, 0], atol=1e-15)
+        measured, gradient = distance_to(geoms, np.array([0.02, 0, 0]))
+        np.testing.assert_allclose([measured, *gradient], [0.01, outward, 0, 0], atol=1e-15)
 
 
-def test_no_geom_is_infinitely_far_in_no_direction():
+def test_no_geoms_are_infinitely_far_without_direction():
     distance, outward = distance_to([], np.zeros(3))
     assert distance == np.inf and outward.tolist() == [0, 0, 0]

@@ -1,4 +1,4 @@
-"""Geoms that no environment's variant has are left out on a CPU: what is read is the same, to the last bit."""
+"""Geoms that no environment has are skipped on a CPU; readings are the same to the last bit."""
 
 import math
 
@@ -27,7 +27,7 @@ SENSORS = {
 @pytest.fixture(scope="module")
 def touch(tmp_path_factory):
     objects = {"item": {"body": "item", "variants": VARIANTS}}
-    sensors = {name: own | {"feels": ["item"]} for name, own in SENSORS.items()}
+    sensors = {name: sensor | {"feels": ["item"]} for name, sensor in SENSORS.items()}
     return compiled(tmp_path_factory.mktemp("pad"), ITEM, objects, sensors, pad=PAD)
 
 
@@ -40,27 +40,27 @@ def bits(touch, state):
 @pytest.mark.parametrize("variants", [[0, 0, 0], [1, 1, 1], [2, 2, 2], [0, 2, 0], [0, 1, 2]])
 @pytest.mark.parametrize("odd", [None, math.nan, math.inf])
 @pytest.mark.filterwarnings("ignore:poses of bodies are not finite")
-def test_readings_are_the_same_without_geoms_that_no_environment_has(touch, monkeypatch, variants, odd):
+def test_skipping_absent_geoms_does_not_change_readings(touch, monkeypatch, variants, odd):
     state = example_state(touch.inputs, 3, 0, torch.float64, 0.02)
     state.variant = torch.tensor(variants)[:, None]
     if odd is not None:
         state.body_pos[1, 0, 2] = odd
     counts = []
-    had = geoms_room._had_by_some
+    select = geoms_room._had_by_some
 
     def counted(geoms, is_absent):
-        counts.append((len(had(geoms, is_absent).shapes), len(geoms.shapes)))
-        return had(geoms, is_absent)
+        counts.append((len(select(geoms, is_absent).shapes), len(geoms.shapes)))
+        return select(geoms, is_absent)
 
     monkeypatch.setattr(geoms_room, "_had_by_some", counted)
-    found = bits(touch, state)
-    assert counts and all((kept < num) == (len(set(variants)) < 3) for kept, num in counts)
+    readings = bits(touch, state)
+    assert counts and all((num_selected < num) == (len(set(variants)) < 3) for num_selected, num in counts)
     monkeypatch.setattr(geoms_room, "_had_by_some", lambda geoms, is_absent: geoms)
-    assert found == bits(touch, state)
+    assert readings == bits(touch, state)
 
 
-def test_sizes_of_the_state_are_those_of_whatever_shape_an_environment_has(tmp_path):
-    """A ball and boxes whose sizes are given: distances by hand, to points of a pad 5 cm below."""
+def test_sizes_in_the_state_apply_to_the_shape_of_each_environment(tmp_path):
+    """Distances by hand from a ball and boxes to the points of a pad 5 cm below."""
     variants = [{"type": "sphere", "size": [0.02]}, {"type": "box", "size": [0.01, 0.01, 0.01]}]
     objects = {"item": {"body": "item", "variants": variants, "size": "per_env"}}
     sensor = {"kind": "surface_distance", "max_range": "20 cm", "feels": ["item"]}

@@ -22,11 +22,11 @@ def shared_cache(tmp_path_factory, monkeypatch):
 L_SHAPE = trimesh.util.concatenate(
     [trimesh.creation.box((0.08, 0.02, 0.02)), trimesh.creation.box((0.02, 0.02, 0.06)).apply_translation((-0.03, 0, 0.02))]
 )
-"""A bar along x and one up from its end at x < −0.02: concave where they meet."""
+"""A bar along x and an upright on its end at x < −0.02: concave where they meet."""
 
 
-def test_the_hull_is_felt_by_default_and_said_to_be():
-    """A probe half way on the hull's slanted face, which leads from (x −.02, z .05) to (.04, .01), 20 mm above the bar."""
+def test_the_hull_is_felt_by_default_with_a_warning():
+    """A probe is halfway along the hull's slanted face from (x −.02, z .05) to (.04, .01), 20 mm above the bar."""
     probe = [(0.01, 0, 0.03)]
     with pytest.warns(
         UserWarning, match=r'object item: MuJoCo collides the convex hull of geom "item", up to [0-9.]+ mm off the mesh'
@@ -39,7 +39,7 @@ def test_the_hull_is_felt_by_default_and_said_to_be():
     assert touch(scene)["s"].item() == pytest.approx(R - 0.004, abs=1e-6)
 
 
-def test_a_named_geom_is_felt_as_it_is():
+def test_a_named_geom_is_felt_instead_of_its_hull():
     geoms = (
         '<geom name="skin" type="mesh" mesh="item" contype="0" conaffinity="0"/><geom name="core" type="sphere" size=".005"/>'
     )
@@ -64,7 +64,7 @@ def test_a_grid_over_its_budget_is_refused():
         mesh_scene(trimesh.creation.icosphere(radius=0.05), [(0, 0, 0)], tolerance=1e-7, max_bytes=100_000)
 
 
-def test_explain_tells_what_a_grid_costs():
+def test_explain_gives_size_and_accuracy_of_a_grid():
     touch, _ = mesh_scene(trimesh.creation.icosphere(subdivisions=4, radius=HALF), [(0, 0, HALF)])
     text = touch.explain()
     assert "tri" in text and "99 % within" in text and "bytes" in text
@@ -73,12 +73,12 @@ def test_explain_tells_what_a_grid_costs():
 
 
 @pytest.mark.parametrize("query", ["sdf", "raycast"])
-def test_an_artefact_keeps_the_mesh(tmp_path, query):
+def test_a_loaded_artefact_reads_the_same(tmp_path, query):
     rng = np.random.default_rng(1)
     touch, scene = mesh_scene(trimesh.creation.icosphere(radius=HALF), rng.normal(scale=0.015, size=(50, 3)), query=query)
     tgdsl.save(touch, tmp_path / "a.safetensors")
-    again = tgdsl.load(tmp_path / "a.safetensors", dtype=torch.float64)
-    torch.testing.assert_close(again(scene)["s"], touch(scene)["s"], rtol=0, atol=0)
+    loaded = tgdsl.load(tmp_path / "a.safetensors", dtype=torch.float64)
+    torch.testing.assert_close(loaded(scene)["s"], touch(scene)["s"], rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("query", ["sdf", "raycast"])

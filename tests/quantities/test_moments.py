@@ -13,7 +13,7 @@ def planes_of(points):
 
 
 def test_a_plane_has_the_derivatives_of_its_integral():
-    """dS0/dz = −∂/∂d: by the closed form −2π d (R − d) sign z; an inactive probe reads and follows nothing."""
+    """dS0/dz is −2π d (R − d) sign z; an inactive probe reads 0 and has no slope."""
     height = torch.tensor([0.004, -0.004, 0.0, 0.02], dtype=torch.float64, requires_grad=True)
     zero = torch.zeros(4, dtype=torch.float64)
     mass, _ = plane_moments((zero, zero, height), torch.tensor(0.01, dtype=torch.float64))
@@ -25,7 +25,7 @@ def test_a_plane_has_the_derivatives_of_its_integral():
 
 
 def linear_field(channels=4, tables=1):
-    """Fields of a polynomial that is linear along each axis within the cells of the middle, zero on the rim."""
+    """Return random values of trilinear fields, zero at the border."""
     rng = np.random.default_rng(0)
     num, cell, origin = (7, 6, 8), 0.01, np.array([-0.03, -0.02, -0.04])
     values = np.zeros((tables, *num, channels))
@@ -50,22 +50,22 @@ def test_a_field_is_trilinear_and_zero_outside():
     assert (expected[:, 0] != 0).sum() > 50 and (expected[:, 0] == 0).sum() > 50
 
 
-def test_each_point_asks_its_own_table():
+def test_each_point_reads_its_own_table():
     values, num, cell, origin = linear_field(tables=2)
-    which = torch.tensor([0, 1, 1, 0])
+    table = torch.tensor([0, 1, 1, 0])
     points = planes_of(np.random.default_rng(2).uniform(-0.02, 0.02, (4, 3)))
-    counts = tuple(torch.tensor([n, n])[which] for n in num)
-    place = torch.tensor(np.stack([origin, origin]))[which]
-    both = MomentField(
+    counts = tuple(torch.tensor([n, n])[table] for n in num)
+    place = torch.tensor(np.stack([origin, origin]))[table]
+    field = MomentField(
         torch.tensor(values.reshape(-1, 4)),
-        torch.tensor([0, int(np.prod(num))])[which],
+        torch.tensor([0, int(np.prod(num))])[table],
         counts,
         split(place),
-        torch.tensor([cell, cell], dtype=torch.float64)[which],
+        torch.tensor([cell, cell], dtype=torch.float64)[table],
     )
-    mass, _ = field_moments(points, both)
+    mass, _ = field_moments(points, field)
     alone = [field_moments(points, module_field(values[i], num, cell, origin)).mass for i in (0, 1)]
-    torch.testing.assert_close(mass, torch.where(which == 0, *alone))
+    torch.testing.assert_close(mass, torch.where(table == 0, *alone))
 
 
 def test_a_shift_of_the_radius_is_first_order():
@@ -78,7 +78,7 @@ def test_a_shift_of_the_radius_is_first_order():
     torch.testing.assert_close(first[2], plain.first[2] + 0.002 * slopes.first[2])
 
 
-def test_what_is_no_place_is_no_number():
+def test_positions_that_are_nan_give_nan():
     values, num, cell, origin = linear_field()
     for where in range(3):
         point = [0.0, 0.0, 0.0]
@@ -89,7 +89,7 @@ def test_what_is_no_place_is_no_number():
 
 
 def small_cloud():
-    """Eight points at the corners of a cube of 2 mm, all in the list of the one cube of the lattice, and two fillers."""
+    """Return eight points at the corners of a 2 mm cube, in the single list of the lattice with two fillers."""
     points = np.array([[x, y, z] for x in (0, 0.002) for y in (0, 0.002) for z in (0, 0.002)], float)
     rows = np.concatenate([points, [[1e6] * 3]]).T
     low = torch.full((3,), -0.01, dtype=torch.float64)
@@ -100,15 +100,15 @@ def small_cloud():
     return points, cloud
 
 
-def test_a_cloud_is_a_sum_and_follows_its_points():
+def test_moments_of_a_cloud_are_sums_over_its_points():
     points, cloud = small_cloud()
     at = np.array([[0.001, 0.0005, 0.0], [0.0, 0.0, 0.0], [0.004, 0, 0], [0.1, 0, 0]])
-    way = points[None] - at[:, None]
-    weight = 0.5 * np.maximum(0.003 - np.linalg.norm(way, axis=2), 0)
+    offset = points[None] - at[:, None]
+    weight = 0.5 * np.maximum(0.003 - np.linalg.norm(offset, axis=2), 0)
     radius = torch.full((4,), 0.003, dtype=torch.float64)
     mass, first = cloud_moments(planes_of(at), cloud, radius)
     np.testing.assert_allclose(mass, weight.sum(axis=1), atol=1e-18)
-    np.testing.assert_allclose(torch.stack(first, dim=1), (weight[..., None] * way).sum(axis=1), atol=1e-20)
+    np.testing.assert_allclose(torch.stack(first, dim=1), (weight[..., None] * offset).sum(axis=1), atol=1e-20)
     assert (mass[:3] > 0).all() and mass[3] == 0
 
 
@@ -124,8 +124,8 @@ def test_a_point_on_a_sampled_point_has_finite_derivatives():
     )
 
 
-def test_splines_are_those_of_scipy_and_have_no_jumps():
-    """The same factors summed by SciPy; constant from half a cell within the border on."""
+def test_splines_match_scipy_and_have_continuous_slopes():
+    """They are constant within half a cell of the border."""
     from scipy.ndimage import map_coordinates
 
     values, num, cell, origin = linear_field()

@@ -9,7 +9,7 @@ from tgdsl.geometry.planes import Vec
 from tgdsl.quantities.moment_sums import FELT_MOMENTS
 
 TOLERANCE = 1e-5
-"""Of full scale: float32 places within a cell of a lattice of 8 nodes, times the slope of a random field."""
+"""Fraction of full scale: float32 rounding within a cell of 8 nodes, times the slope of a random field."""
 
 
 def stacked(mass: torch.Tensor, first: Vec) -> torch.Tensor:
@@ -21,33 +21,33 @@ def compare() -> None:
     use_kernels()
 
     def moments(pairs, pos, source, is_kernel):
-        way = FELT_MOMENTS.kernel if is_kernel else FELT_MOMENTS.definition
-        return stacked(*way(pairs, source.target.pairs, pos, source))
+        implementation = FELT_MOMENTS.kernel if is_kernel else FELT_MOMENTS.definition
+        return stacked(*implementation(pairs, source.target.pairs, pos, source))
 
     for case in CASES:
         expected = moments(*made(case, torch.float64), False)
-        found = moments(*made(case, torch.float32), True)
-        assert found.dtype == torch.float32 and found.shape == expected.shape, case
+        result = moments(*made(case, torch.float32), True)
+        assert result.dtype == torch.float32 and result.shape == expected.shape, case
         torch.testing.assert_close(
-            found.double(), expected, rtol=0, atol=TOLERANCE * (expected.numel() and float(expected.abs().max()))
+            result.double(), expected, rtol=0, atol=TOLERANCE * (expected.numel() and float(expected.abs().max()))
         )
         if expected.numel() > 100:
             assert (expected[0] == 0).sum() > 5 and (expected[0] != 0).sum() > 5, case
-    for case, spoilt in (("several links", "rotation"), ("by both", "offset")):
+    for case, vector in (("several links", "rotation"), ("by both", "offset")):
         pairs, pos, source = made(case, torch.float32)
-        getattr(pairs, spoilt)[1][1, 1] = torch.nan
-        expected, found = (moments(pairs, pos, source, is_kernel) for is_kernel in (False, True))
+        getattr(pairs, vector)[1][1, 1] = torch.nan
+        expected, result = (moments(pairs, pos, source, is_kernel) for is_kernel in (False, True))
         assert expected.isnan().any()
-        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4, equal_nan=True)
-    for far in (torch.inf, -1e30):
+        torch.testing.assert_close(result, expected, rtol=1e-4, atol=1e-4, equal_nan=True)
+    for offset in (torch.inf, -1e30):
         pairs, pos, source = made("several links", torch.float32)
-        pairs.offset[2][:] = far
+        pairs.offset[2][:] = offset
         assert (moments(pairs, pos, source, True) == 0).all()
 
 
 @pytest.mark.slow
 @needs_triton
-def test_the_kernel_is_the_torch_code():
+def test_the_kernel_matches_the_torch_code():
     interpreted(__file__)
 
 

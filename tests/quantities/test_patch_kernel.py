@@ -8,36 +8,37 @@ from kernels import interpreted, needs_triton, use_kernels
 from tgdsl.quantities.patch import CONTACT_PATCH, patch
 
 TOLERANCES = {"force": 2e-5, "area": 2e-8, "pos": 2e-5, "normal": 2e-5}
-"""Some roundings of float32 of forces of 10 N, places some metres away, and points of 1 cm about them [N, m², m]."""
+"""Some float32 roundings of forces of 10 N, centres metres away and points within 1 cm of them [N, m², m]."""
 
 
 def check(case):
-    """What the kernel finds is what the definition does."""
+    """Require that the kernel matches the definition."""
     exact, arguments = (contact_patches.arguments(case, dtype) for dtype in (torch.float64, torch.float32))
     assert CONTACT_PATCH.takes_kernel(*arguments), case
-    expected, found = patch(*exact), CONTACT_PATCH(*arguments)
+    expected, result = patch(*exact), CONTACT_PATCH(*arguments)
     for name, tolerance in TOLERANCES.items():
-        part, other = (
-            torch.stack(own) if isinstance(own, tuple) else own for own in (getattr(found, name), getattr(expected, name))
+        actual, reference = (
+            torch.stack(value) if isinstance(value, tuple) else value
+            for value in (getattr(result, name), getattr(expected, name))
         )
-        assert (part.double() - other).abs().max() <= tolerance, (case, name, (part.double() - other).abs().max())
-    assert (found.force > 0).any() and (found.force == 0).any(), case
-    assert (found.area > 0).any() == (contact_patches.CASES[case].slots > 2), case
+        assert (actual.double() - reference).abs().max() <= tolerance, (case, name, (actual.double() - reference).abs().max())
+    assert (result.force > 0).any() and (result.force == 0).any(), case
+    assert (result.area > 0).any() == (contact_patches.CASES[case].slots > 2), case
 
 
 def check_strange_numbers():
-    """What is not a number comes out, in no other environment; so does the force of a contact without a normal."""
+    """NaN comes out, only in its own environment; so does a contact without a normal."""
     contacts, sides, _ = contact_patches.arguments("four slots", torch.float32)
     pair, body = int(sides.pairs[1, 0]), int(sides.bodies[0])
-    for name, place in (("force", (5, pair, 0, 1)), ("pos", (6, pair, 0, 0)), ("body_quat", (7, body, 2))):
+    for name, index in (("force", (5, pair, 0, 1)), ("pos", (6, pair, 0, 0)), ("body_quat", (7, body, 2))):
         contacts, *rest = contact_patches.arguments("four slots", torch.float32)
         contacts.force[5:7] = contacts.normal[5:7] = 1.0
-        getattr(contacts, name)[place] = torch.nan
-        ours, theirs = CONTACT_PATCH(contacts, *rest), patch(contacts, *rest)
-        found, wanted = (torch.stack([own.force, *own.pos]) for own in (ours, theirs))
-        others = [env for env in range(contact_patches.NUM_ENVS) if env != place[0]]
-        assert found[:, place[0]].isnan().any() and torch.equal(found.isnan(), wanted.isnan()), name
-        assert not found[:, others].isnan().any(), name
+        getattr(contacts, name)[index] = torch.nan
+        from_kernel, from_torch = CONTACT_PATCH(contacts, *rest), patch(contacts, *rest)
+        result, expected = (torch.stack([patches.force, *patches.pos]) for patches in (from_kernel, from_torch))
+        others = [env for env in range(contact_patches.NUM_ENVS) if env != index[0]]
+        assert result[:, index[0]].isnan().any() and torch.equal(result.isnan(), expected.isnan()), name
+        assert not result[:, others].isnan().any(), name
     contacts, *rest = contact_patches.arguments("four slots", torch.float32)
     contacts.force[5], contacts.normal[5] = 1.0, 0.0
     assert CONTACT_PATCH(contacts, *rest).force[5].isnan().all() and patch(contacts, *rest).force[5].isnan().all()
@@ -53,7 +54,7 @@ def compare() -> None:
 
 @pytest.mark.slow
 @needs_triton
-def test_the_kernel_is_the_torch_code():
+def test_the_kernel_matches_the_torch_code():
     interpreted(__file__)
 
 

@@ -1,4 +1,4 @@
-"""That what a kernel finds of one geom of the links after the other is put together as the definition has it."""
+"""The kernel's results for one geom at a time combine to the definition."""
 
 import sys
 from types import SimpleNamespace
@@ -13,7 +13,7 @@ from tgdsl.quantities.points import LINK_POINTS, link_points
 
 
 def meet(pairs, pair, points, links, g):
-    """Do what the kernel does of one geom, by distances: places in the links' frames, distances and gradients."""
+    """Do what the kernel does for one geom: return positions in the links' frames, distances and gradients."""
     rotation, offset = ([part[:, pair, None] for part in parts] for parts in (pairs.rotation, pairs.offset))
     pos = planes.rotate_back(planes.rot(rotation), planes.sub(points, planes.vec(offset)))
     parts = {name: getattr(links, name)[:, g : g + 1] for name in ("size", "pos", "rotation")}
@@ -24,11 +24,11 @@ def meet(pairs, pair, points, links, g):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_kernels_way_is_the_definition(monkeypatch, case):
+def test_combined_kernel_results_match_the_definition(monkeypatch, case):
     monkeypatch.setitem(sys.modules, "tgdsl.quantities.depth_kernel", SimpleNamespace(meet=meet))
-    own = made(case, torch.float64)
-    found, expected = LINK_POINTS.kernel(own), link_points(own)
+    points = made(case, torch.float64)
+    result, expected = LINK_POINTS.kernel(points), link_points(points)
     for name in ("pos", "distance", "gradient", "area"):
-        torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=0, atol=1e-12)
-    assert found.taxels == own.source.taxels and torch.equal(found.tiles, own.source.tiles)
-    assert (found.distance == torch.inf).any() == (own.pairs.gate is not None)
+        torch.testing.assert_close(getattr(result, name), getattr(expected, name), rtol=0, atol=1e-12)
+    assert result.taxels == points.source.taxels and torch.equal(result.tiles, points.source.tiles)
+    assert (result.distance == torch.inf).any() == (points.pairs.gate is not None)

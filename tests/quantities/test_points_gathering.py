@@ -1,4 +1,4 @@
-"""Gathered points: what kernels read of a pose lies in memory alike, whatever the gate."""
+"""The memory layout of poses of gathered points is the same for every gate."""
 
 import pytest
 import torch
@@ -16,7 +16,7 @@ SCENE = """<mujoco><worldbody>
 
 @pytest.mark.parametrize("gate", ["contact_pair", "geometric"])
 def test_planes_of_a_rotation_and_of_an_offset_have_the_same_strides(tmp_path, gate):
-    """A kernel steps through the nine and the three planes by the strides of the first of each."""
+    """A kernel steps through all nine and all three planes by the strides of the first."""
     (tmp_path / "scene.xml").write_text(SCENE)
     points = {"method": "points", "points": [{"pos": [0, 0, 0.01], "normal": [0, 0, 1], "radius": 0.004}]}
     document = {
@@ -31,6 +31,6 @@ def test_planes_of_a_rotation_and_of_an_offset_have_the_same_strides(tmp_path, g
     state = touch.example_state(5)
     tensors = {name: getattr(state, name) for name in touch.inputs.fields if name != "dt"}
     scene = scene_of(touch.plan, touch.constants.tree, tensors, {}, {}, torch.float32)
-    ((own,),) = [found.values() for found in POINTS.gather(touch.constants.tree["quantities"]["points"], scene)]
-    strides = [{part.stride() for part in parts} for parts in (own.pairs.rotation, own.pairs.offset)]
-    assert [len(found) for found in strides] == [1, 1] and (own.pairs.gate is not None) == (gate == "contact_pair")
+    ((points_of_object,),) = [found.values() for found in POINTS.gather(touch.constants.tree["quantities"]["points"], scene)]
+    strides = [{part.stride() for part in parts} for parts in (points_of_object.pairs.rotation, points_of_object.pairs.offset)]
+    assert [len(found) for found in strides] == [1, 1] and (points_of_object.pairs.gate is not None) == (gate == "contact_pair")

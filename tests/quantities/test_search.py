@@ -1,4 +1,4 @@
-"""That `search` makes of a kernel's answer what `penetration` makes of distances; the kernel itself is tested beside it."""
+"""`search` with a kernel agrees with `penetration` of distances; `test_deepest_kernel` tests the kernel itself."""
 
 from dataclasses import replace
 
@@ -32,19 +32,24 @@ from tgdsl.tensors import operations
 
 NUM_LINKS, NUM_OBJECTS, NUM_ENVS, NUM_TAXELS = 2, 6, 5, 40
 WHICH = (0, 1, 2, 4, 5)
-"""The objects that are felt."""
+"""The objects that the sensors feel."""
 
 
 def brute_force(pairs, probes, targets, known, reach):
-    """Return what the kernel does of centred boxes, from the tables and the distances."""
-    own = [target.geoms for target in targets]
-    spheres, geoms = (known["spheres"], known["geoms"]) if "geoms" in known else geom_tables(own)
+    """Do what the kernel does for centred boxes, by distances."""
+    geoms_of_targets = [target.geoms for target in targets]
+    spheres, geoms = (known["spheres"], known["geoms"]) if "geoms" in known else geom_tables(geoms_of_targets)
     ends = spheres[0, :, 1].cumsum(0).long()
     boxes = [box(geoms[:, end - 1 : end, :3], 0, pairs.offset[0].shape[1]) for end in ends]
     every = Probes(probes.pos, known["pair"])
     near = measure(pairs, every, boxes)
     felt = penetration(pairs, every, near, reach, ("normal",))
-    depths = torch.stack([r + pairs.gate[:, own.pair] - own.distance for r, own in zip(reach, near, strict=True)])
+    depths = torch.stack(
+        [
+            r + pairs.gate[:, geoms_of_targets.pair] - geoms_of_targets.distance
+            for r, geoms_of_targets in zip(reach, near, strict=True)
+        ]
+    )
     deepest = depths.max(dim=0)
     pair = known["pair"].gather(0, deepest.indices)
     return Deepest(felt.depth, felt.normal, torch.where(deepest.values > 0, pair, -1))
@@ -52,7 +57,7 @@ def brute_force(pairs, probes, targets, known, reach):
 
 @pytest.fixture
 def kernel(monkeypatch):
-    """A kernel that runs everywhere, in float64."""
+    """Replace the kernel by one that runs everywhere, in float64."""
     monkeypatch.setattr(contact_depth, "DEEPEST", replace(DEEPEST, kernel=brute_force))
     monkeypatch.setattr(operations, "are_kernel_inputs", lambda *_: True)
 
@@ -65,7 +70,7 @@ def box(size, first_pair, num_pairs, name="box"):
 
 @pytest.fixture
 def scene():
-    """Two links and six boxes, some of which each probe reaches; which pairs are felt, and how far."""
+    """Return two links and six boxes, some within each probe's reach, with the felt pairs and reaches."""
     generator = torch.Generator().manual_seed(0)
 
     def random(*shape):
@@ -88,35 +93,37 @@ def scene():
 
 
 @pytest.mark.parametrize("is_known", [True, False])
-def test_motion_is_that_of_the_object_found(scene, kernel, is_known):
+def test_motion_is_that_of_the_deepest_object(scene, kernel, is_known):
     pairs, probes, boxes, pair, reach = scene
     wants, felt = ("motion", "normal"), [boxes[i] for i in WHICH]
     known = {"pair": pair} | (
-        dict(zip(("spheres", "geoms"), geom_tables([own.geoms for own in felt]), strict=True)) if is_known else {}
+        dict(zip(("spheres", "geoms"), geom_tables([target.geoms for target in felt]), strict=True)) if is_known else {}
     )
-    found = search(pairs, probes, felt, known, reach, wants)
+    result = search(pairs, probes, felt, known, reach, wants)
     near = measure(pairs, probes, boxes)
     expected = penetration(pairs, probes, [near[i] for i in WHICH], reach, wants)
     assert 0.2 < (expected.depth > 0).double().mean() < 0.9
-    torch.testing.assert_close(found.depth, expected.depth)
-    for part, other in zip(
-        (*found.normal, *found.velocity, *found.angular), (*expected.normal, *expected.velocity, *expected.angular), strict=True
+    torch.testing.assert_close(result.depth, expected.depth)
+    for actual, reference in zip(
+        (*result.normal, *result.velocity, *result.angular),
+        (*expected.normal, *expected.velocity, *expected.angular),
+        strict=True,
     ):
-        torch.testing.assert_close(part, other)
+        torch.testing.assert_close(actual, reference)
 
 
-def test_the_definition_is_the_deepest_of_all_distances(scene):
+def test_the_definition_equals_the_deepest_of_all_distances(scene):
     pairs, probes, boxes, pair, reach = scene
     arguments = pairs, probes, [boxes[i] for i in WHICH], {"pair": pair}, reach
-    found, expected = deepest(*arguments), brute_force(*arguments)
-    assert torch.equal(found.pair, expected.pair) and (found.pair >= 0).any() and (found.pair < 0).any()
-    for part, other in zip((found.depth, *found.normal), (expected.depth, *expected.normal), strict=True):
-        torch.testing.assert_close(part, other)
+    result, expected = deepest(*arguments), brute_force(*arguments)
+    assert torch.equal(result.pair, expected.pair) and (result.pair >= 0).any() and (result.pair < 0).any()
+    for part, reference in zip((result.depth, *result.normal), (expected.depth, *expected.normal), strict=True):
+        torch.testing.assert_close(part, reference)
 
 
 @pytest.mark.parametrize("num_geoms", [(2, 4), (3, 3)], ids=["unlike", "alike"])
-def test_the_spheres_that_hold_geoms_are_mujocos(num_geoms):
-    """Of an object whose geoms are there in some environments, and of one that is alike in all."""
+def test_bounding_spheres_of_geoms_are_mujocos(num_geoms):
+    """One object lacks geoms in some environments; the other is the same in all."""
     shapes, generator = ("box", "capsule", "cylinder", "sphere", "plane", "box"), np.random.default_rng(0)
     size, pos = generator.uniform(0.01, 0.03, (6, 3)), generator.normal(size=(6, 3))
     model = mujoco.MjSpec()
@@ -134,18 +141,18 @@ def test_the_spheres_that_hold_geoms_are_mujocos(num_geoms):
     spheres, geoms = (table.numpy() for table in geom_tables(objects))
     of_geoms, about_bodies = (np.where(is_absent, -np.inf, reach) for reach in (radius, radius + np.linalg.norm(pos, axis=1)))
     of_objects = np.stack([own.max(axis=1) for own in np.split(about_bodies, [first], axis=1)], axis=1)
-    for found, exact in ((geoms[..., BOUND], of_geoms), (spheres[..., 0], of_objects)):
-        np.testing.assert_allclose(found, exact, rtol=1e-12, atol=2 * MARGIN)
-        assert (found >= exact).all()
+    for radii, exact in ((geoms[..., BOUND], of_geoms), (spheres[..., 0], of_objects)):
+        np.testing.assert_allclose(radii, exact, rtol=1e-12, atol=2 * MARGIN)
+        assert (radii >= exact).all()
     assert (spheres[..., 1] == num_geoms).all() and (geoms[..., POS:ROTATION] == pos).all()
 
 
-def test_a_cpu_has_no_kernel_for_it(scene):
+def test_a_cpu_has_no_kernel(scene):
     pairs, probes, boxes, pair, reach = scene
     assert search(pairs, probes, [boxes[i] for i in WHICH], {"pair": pair}, reach, ("normal",)) is None
 
 
-def test_what_the_kernel_cannot_answer_is_left_to_torch():
+def test_unsupported_searches_are_left_to_torch():
     many = ["box"] * contact_depth.THRESHOLD
     assert is_searchable(many, {"normal", "motion"}) and is_searchable(many, ())
     assert not is_searchable(many, {"normal", "distance"})
@@ -153,23 +160,23 @@ def test_what_the_kernel_cannot_answer_is_left_to_torch():
     assert not is_searchable([*many, "ellipsoid"], {"normal"})
 
 
-def test_a_module_asks_the_kernel_of_the_tables_that_its_plan_holds(tmp_path, kernel, monkeypatch):
-    """Six boxes about a pad: the kernel reads what distances do, of tables that were made beforehand."""
+def test_a_module_passes_the_tables_of_its_plan_to_the_kernel(tmp_path, kernel, monkeypatch):
+    """Six boxes around a pad: the kernel reads precomputed tables and agrees with distances."""
     bodies = "".join(f'<body name="b{i}"><freejoint/><geom type="box" size=".02 .01 .0{i + 1}"/></body>' for i in range(6))
     names = [f"b{i}" for i in range(6)]
     sensors = {"depth": {"kind": "contact_depth", "feels": names}}
     touch = compiled(tmp_path, bodies, {name: {"body": name} for name in names}, sensors)
     state = example_state(touch.inputs, 3, 0, torch.float64, 0.02)
-    asked = []
+    tables = []
 
     def spied(pairs, probes, targets, known, reach):
-        asked.append(set(known))
+        tables.append(set(known))
         return brute_force(pairs, probes, targets, known, reach)
 
     monkeypatch.setattr(contact_depth, "DEEPEST", replace(DEEPEST, kernel=spied))
-    found = touch(state)["depth"]
-    assert asked == [{"pair", "spheres", "geoms"}]
+    depth = touch(state)["depth"]
+    assert tables == [{"pair", "spheres", "geoms"}]
     monkeypatch.undo()
     expected = touch(state)["depth"]
-    assert len(asked) == 1 and (expected > 0).any() and (expected == 0).any()
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+    assert len(tables) == 1 and (expected > 0).any() and (expected == 0).any()
+    torch.testing.assert_close(depth, expected, rtol=0, atol=1e-12)

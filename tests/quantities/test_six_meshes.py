@@ -1,4 +1,4 @@
-"""Six awkward meshes from file to reading: each query within what it promises, against brute force over all triangles."""
+"""Six awkward meshes from file to reading: each query within its tolerance, against brute force over all triangles."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def open_box():
 
 
 def slivers():
-    """A box one side of which is cut into needles, as thin as 1 to 3,000."""
+    """Return a box with one side cut into needles, as thin as 1 to 3,000."""
     cuts = -0.02 + np.array([0, 1e-5, 4e-5, 2e-4, 3e-3, 0.04])
     top = np.array([[-0.015, cuts[0], 0.01], *([0.015, y, 0.01] for y in cuts), [-0.015, 0.02, 0.01]])
     num = len(top)
@@ -43,12 +43,12 @@ def slivers():
 
 
 def nested():
-    """A box that holds a ball of the same orientation, as fingertips hold screws: solid all through."""
+    """Return a box around a ball of the same winding, like a fingertip around a screw: solid throughout."""
     return trimesh.util.concatenate([box(0.04, 0.03, 0.03), ball(0.006, 2)])
 
 
 def bracket():
-    """A bar and an upright on its end, made one: concave where they meet."""
+    """Return a concave L: a bar and an upright on its end."""
     outline = np.array([[-0.02, -0.01], [0.02, -0.01], [0.02, 0.0], [-0.01, 0.0], [-0.01, 0.02], [-0.02, 0.02]])
     faces = np.array([[0, 1, 3], [1, 2, 3], [0, 3, 5], [3, 4, 5]])
     num = len(outline)
@@ -66,11 +66,11 @@ MESHES = {
     "inner shell": (nested, 1.0, lambda: box(0.04, 0.03, 0.03)),
     "bracket": (bracket, 1.0, None),
 }
-"""The mesh as filed, its scale, and the solid that it stands for where that is not what the triangles say."""
+"""The mesh as filed, its scale, and the solid that it represents if its triangles do not bound it."""
 
 
 def points_near(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Points within reach of the surface, on both sides, near edges and corners as often as elsewhere."""
+    """Return points within reach of the surface, on both sides, half of them near edges."""
     rng = np.random.default_rng(0)
     on, _ = trimesh.sample.sample_surface(mesh, NUM_POINTS // 2, seed=1)
     edges = mesh.vertices[mesh.edges[rng.integers(0, len(mesh.edges), NUM_POINTS - len(on))]]
@@ -82,7 +82,7 @@ def points_near(mesh: trimesh.Trimesh) -> np.ndarray:
 
 
 def readings(folder, mesh, scale, points, **target):
-    """Return the distance [m] that each probe reads, and what was measured of the grid."""
+    """Return the distance [m] that each probe reads, and the measured accuracy of the grid."""
     mesh.export(folder / "item.stl")
     (folder / "scene.xml").write_text(
         f'<mujoco><asset><mesh name="item" file="item.stl" scale="{scale} {scale} {scale}" inertia="shell"/></asset><worldbody>'
@@ -131,13 +131,13 @@ def cache(tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MESHES)
 @pytest.mark.filterwarnings("ignore:object item. .* is not closed:UserWarning")
-def test_a_grid_holds_its_tolerance_at_points_it_never_saw(tmp_path, name):
+def test_a_grid_holds_its_tolerance_at_new_points(tmp_path, name):
     make, scale, solid = MESHES[name]
-    stands_for = solid() if solid is not None else make().apply_scale(scale)
-    points = points_near(stands_for)
-    found, accuracy = readings(tmp_path, make(), scale, points, tolerance=TOLERANCE)
-    error = np.abs(found - signed(stands_for, points))
-    is_edge = to_sharp_edge(stands_for, points) < accuracy["cell"]
+    represented = solid() if solid is not None else make().apply_scale(scale)
+    points = points_near(represented)
+    distances, accuracy = readings(tmp_path, make(), scale, points, tolerance=TOLERANCE)
+    error = np.abs(distances - signed(represented, points))
+    is_edge = to_sharp_edge(represented, points) < accuracy["cell"]
     assert np.percentile(error[~is_edge], 99) <= TOLERANCE
     assert not is_edge.any() or np.percentile(error[is_edge], 99) <= EDGE_FACTOR * TOLERANCE
 
@@ -145,9 +145,9 @@ def test_a_grid_holds_its_tolerance_at_points_it_never_saw(tmp_path, name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MESHES)
 @pytest.mark.filterwarnings("ignore:object item. .* is not closed:UserWarning")
-def test_raycast_is_brute_force(tmp_path, name):
+def test_raycast_equals_brute_force(tmp_path, name):
     make, scale, solid = MESHES[name]
     mesh = solid() if solid is not None else make().apply_scale(scale)
     points = points_near(mesh)
-    found, _ = readings(tmp_path, make(), scale, points, query="raycast")
-    np.testing.assert_allclose(found, signed(mesh, points), rtol=0, atol=1e-6)
+    distances, _ = readings(tmp_path, make(), scale, points, query="raycast")
+    np.testing.assert_allclose(distances, signed(mesh, points), rtol=0, atol=1e-6)
