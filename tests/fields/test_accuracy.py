@@ -1,4 +1,4 @@
-"""Accuracies as documents have them."""
+"""Accuracies in documents."""
 
 import re
 
@@ -27,8 +27,8 @@ ADAPTER = TypeAdapter(AccuracyField)
     ],
 )
 def test_bounds_are_in_the_unit_of_readings(text, value, unit):
-    found = parse_bound(text)
-    assert found.value == pytest.approx(value, rel=1e-12) and found.unit == unit
+    bound = parse_bound(text)
+    assert bound.value == pytest.approx(value, rel=1e-12) and bound.unit == unit
 
 
 @pytest.mark.parametrize("wrong", ["0 %", "-1 %", "100 %", 1, 0, -0.1, "-2 mm", "0 mm"])
@@ -38,15 +38,15 @@ def test_a_bound_is_above_zero_and_a_fraction_below_one(wrong):
 
 
 @pytest.mark.parametrize("wrong", ["5 furlongs", "1 kg", "much", True, None, [1]])
-def test_what_is_no_accuracy_is_told_the_units(wrong):
+def test_wrong_accuracies_name_the_units(wrong):
     with pytest.raises(ValueError, match=re.escape(EXPECTED)):
         parse_bound(wrong)
 
 
 def test_each_quantity_has_its_bound():
-    found = ADAPTER.validate_python({"force": "5 mN", "torque": "1 %"})
-    assert found == Accuracy((("force", Bound(5e-3, "N", "5 mN")), ("torque", Bound(0.01, "", "1 %"))))
-    assert found.of("torque").value == 0.01 and found.of("depth") is None and str(found) == "force 5 mN, torque 1 %"
+    accuracy = ADAPTER.validate_python({"force": "5 mN", "torque": "1 %"})
+    assert accuracy == Accuracy((("force", Bound(5e-3, "N", "5 mN")), ("torque", Bound(0.01, "", "1 %"))))
+    assert accuracy.of("torque").value == 0.01 and accuracy.of("depth") is None and str(accuracy) == "force 5 mN, torque 1 %"
     assert ADAPTER.validate_python("1 %").of("anything").value == 0.01
     assert ADAPTER.validate_python(None) is None
     with pytest.raises(ValidationError, match="found a mapping of 0"):
@@ -60,8 +60,8 @@ def test_the_schema_has_the_bounds_of_numbers_and_of_a_mapping():
     assert each["additionalProperties"]["anyOf"][0] == number
 
 
-def test_the_schema_takes_what_is_read():
-    patterns = [own["pattern"] for own in ADAPTER.json_schema()["anyOf"] if own.get("type") == "string"]
+def test_the_schema_accepts_what_the_parser_reads():
+    patterns = [option["pattern"] for option in ADAPTER.json_schema()["anyOf"] if option.get("type") == "string"]
     for text in ("1%", ".5 %", "0.02 mm", "2 N*mm", "0.5 K"):
         assert re.search(patterns[0], text)
     for text in ("5 furlongs", "1 kg", "% 1"):

@@ -1,4 +1,4 @@
-"""Quantities that must be more than zero take any that are, however small."""
+"""Positive quantities accept any value above zero, however small."""
 
 import pytest
 from pydantic import TypeAdapter, ValidationError
@@ -7,7 +7,7 @@ from tgdsl.fields.models import Angle, Area, Frequency, Positive, Pressure
 
 
 @pytest.mark.parametrize("kind", [Area, Angle, Frequency, Pressure, Positive])
-def test_what_must_be_more_than_zero(kind):
+def test_positive_quantities_reject_zero_and_below(kind):
     adapter = TypeAdapter(kind)
     assert adapter.validate_python(1e-9) == 1e-9
     for value in (0, -1.0):

@@ -1,4 +1,4 @@
-"""Quantities against powers of ten, and arbitrary text."""
+"""Quantities against powers of ten and arbitrary text."""
 
 import math
 import re
@@ -26,7 +26,7 @@ def test_millimetres_are_thousandths(x):
 
 PREFIXES = {"G": 9, "M": 6, "k": 3, "c": -2, "m": -3, "u": -6, "µ": -6}
 SYMBOLS = {"m": 0, "g": -3, "s": 0, "N": 0, "Pa": 0, "Hz": 0, "W": 0, "J": 0, "K": 0, "rad": 0}
-"""Power of ten from a symbol to its SI unit: the gram is the one that is not coherent."""
+"""Powers of ten from symbols to SI units; only the gram is not coherent."""
 
 
 def si_factor(unit):
@@ -39,10 +39,10 @@ def si_factor(unit):
     return float(f"1e{exponent}")
 
 
-def test_every_unit_has_the_factor_of_si():
+def test_every_unit_has_its_si_factor():
     assert si_factor("kW/m2") == 1e3 and si_factor("/cm2") == 1e4 and si_factor("kJ/(kg*K)") == 1e3 == si_factor("J/(g*K)")
-    for dimension, known in units.UNITS.items():
-        for unit in known:
+    for dimension, symbols in units.UNITS.items():
+        for unit in symbols:
             factor, zero = {"deg": (math.pi / 180, 0.0), "degC": (1.0, 0.0), "K": (1.0, -273.15)}.get(unit) or (
                 si_factor(unit),
                 0.0,
@@ -61,7 +61,7 @@ def test_units_agree_with_each_other():
     assert units.parse("1 W/cm2", "heat_flux") == pytest.approx(1 / units.parse("1 cm2", "area"), rel=RTOL)
 
 
-def test_kelvin_have_another_zero():
+def test_kelvin_has_another_zero():
     assert (
         units.parse("0 degC", "temperature") == units.parse("273.15 K", "temperature") == units.parse(0, "temperature") == 0.0
     )
@@ -82,14 +82,14 @@ def test_kelvin_have_another_zero():
         ("4 J/(kg⋅K)", "specific_heat", "4 J/(kg*K)"),
     ],
 )
-def test_other_spellings_are_told_how_it_is_here(value, dimension, meant):
+def test_other_spellings_suggest_the_known_one(value, dimension, meant):
     with pytest.raises(ValueError) as caught:  # noqa: PT011 - the whole message is compared
         units.parse(value, dimension)
     assert str(caught.value) == f'"{value}" is not a quantity; did you mean "{meant}"?'
     units.parse(meant, dimension)
 
 
-def test_a_temperature_in_kelvin_that_lacks_its_unit_is_doubted():
+def test_a_kelvin_value_without_its_unit_is_doubted():
     assert units.doubt(318.15, "temperature", 0.0, 250.0) == (
         "found 318.15 degC, usually at most 250 degC",
         'was "318.15 K" meant?',
@@ -99,9 +99,9 @@ def test_a_temperature_in_kelvin_that_lacks_its_unit_is_doubted():
 
 @pytest.mark.parametrize("value", [2, 2.0, "2", "2.", "+2", "0.2e1", ".2e+1", "20E-1"])
 def test_a_bare_number_is_si(value):
-    found = units.parse(value, "length")
-    assert found == 2.0
-    assert isinstance(found, float)
+    length = units.parse(value, "length")
+    assert length == 2.0
+    assert isinstance(length, float)
 
 
 @pytest.mark.parametrize(
@@ -127,7 +127,7 @@ def test_a_bare_number_is_si(value):
         (10**400, "number", "inf is not finite, expected a number"),
     ],
 )
-def test_what_is_no_quantity(value, dimension, message):
+def test_malformed_quantities_are_errors(value, dimension, message):
     with pytest.raises(ValueError) as caught:  # noqa: PT011 - the whole message is compared
         units.parse(value, dimension)
     assert str(caught.value) == message
@@ -140,11 +140,11 @@ def test_what_is_no_quantity(value, dimension, message):
 @settings(max_examples=30)
 def test_anything_is_a_finite_float_or_a_value_error(value, dimension):
     try:
-        found = units.parse(value, dimension)
+        number = units.parse(value, dimension)
     except ValueError:
         return
-    assert isinstance(found, float)
-    assert math.isfinite(found)
+    assert isinstance(number, float)
+    assert math.isfinite(number)
 
 
 CAPACITANCE = Dimension("capacitance", {"F": 1.0, "nF": 1e-9, "pF": 1e-12})
@@ -155,7 +155,7 @@ class Plate(SpecModel):
 
 
 @pytest.mark.parametrize(("written", "value"), [("4.7 pF", 4.7e-12), ("2nF", 2e-9), (3e-12, 3e-12), ("1e-3 nF", 1e-12)])
-def test_a_dimension_of_ones_own(written, value):
+def test_a_custom_dimension_is_parsed(written, value):
     assert Plate(own=written).own == pytest.approx(value, rel=1e-15)
 
 
@@ -167,19 +167,19 @@ def test_a_dimension_of_ones_own(written, value):
         ("-1 pF", "-1e-12 is out of range, expected more than 0"),
     ],
 )
-def test_what_is_wrong_in_it_is_named(written, message):
+def test_errors_of_a_custom_dimension_name_the_problem(written, message):
     with pytest.raises(ValidationError, match=re.escape(message)):
         Plate(own=written)
 
 
-def test_its_schema_takes_its_units_and_doubt_names_them():
+def test_schema_and_doubt_use_the_custom_units():
     pattern = Plate.model_json_schema()["properties"]["own"]["anyOf"][1]["pattern"]
     assert [bool(re.search(pattern, text)) for text in ("4.7 pF", "1e-9F", "4 mm")] == [True, True, False]
     assert doubt(10.0, CAPACITANCE, 0.0, 1e-6) == ("found 10 F, usually at most 1e-06 F", 'was "10 nF" or "10 pF" meant?')
 
 
 @pytest.mark.parametrize("units", [{}, {"pF": 1e-12, "F": 1.0}, {"F": 1.0, "p F": 1e-12}, {"F": 1.0, "pF": 0.0}])
-def test_a_dimension_without_a_unit_inside_or_with_unreadable_ones_is_refused(units):
+def test_invalid_units_of_a_dimension_are_refused(units):
     with pytest.raises(ValueError, match="the units of capacitance: found"):
         Dimension("capacitance", units)
 
@@ -187,7 +187,7 @@ def test_a_dimension_without_a_unit_inside_or_with_unreadable_ones_is_refused(un
 Span = TypeAdapter(Annotated[tuple[float, float], RangeOf("time", ge=0.0, le=2.0)])
 
 
-def test_a_range_is_a_number_or_two_in_order():
+def test_a_range_is_a_number_or_an_ordered_pair():
     assert Span.validate_python("5 ms") == (5e-3, 5e-3)
     assert Span.validate_python([0, "20 ms"]) == (0.0, 0.02)
     assert Span.validate_python([1.0, 1.0]) == (1.0, 1.0)
@@ -202,7 +202,7 @@ def test_a_range_is_a_number_or_two_in_order():
             Span.validate_python(wrong)
 
 
-def test_the_schema_of_a_range_is_a_quantity_or_two():
+def test_the_schema_of_a_range_is_a_quantity_or_a_pair():
     one, two = Span.json_schema()["anyOf"]
     assert one["anyOf"][0] == {"type": "number", "minimum": 0.0, "maximum": 2.0}
     assert two == {"type": "array", "items": one, "minItems": 2, "maxItems": 2}
@@ -211,12 +211,12 @@ def test_the_schema_of_a_range_is_a_quantity_or_two():
 @pytest.mark.parametrize(
     "text", ["1" * 10**6 + "!", "1" + " " * 10**6 + "!", "1." + "1" * 10**6 + "!", "1 " + "m*" * 10**6 + "!"]
 )
-def test_a_quantity_is_read_once_over(text):
-    """A pattern that tries every way to part a run of digits would take days."""
+def test_parsing_takes_linear_time(text):
+    """A pattern that tries every split of a run of digits would take days."""
     with pytest.raises(ValueError, match="is not a quantity"):
         units.parse(text, "length")
 
 
 @pytest.mark.parametrize("text", ["4 mm", "4mm", " -4.e-3 m ", "+.004", "4e-3m", "4E-3"])
-def test_quantities_are_read_as_before(text):
+def test_one_length_has_many_spellings(text):
     assert abs(units.parse(text, "length")) == pytest.approx(0.004, rel=np.finfo(float).eps)
