@@ -1,4 +1,4 @@
-"""Repairs of triangles, by the volume that they then enclose, and what cannot be repaired, by its message."""
+"""Repairs of triangles, checked by the enclosed volume, and messages for irreparable ones."""
 
 import numpy as np
 import pytest
@@ -22,13 +22,13 @@ def changed(mesh: trimesh.Trimesh, vertices=None, faces=None) -> Surface:
     return surface_of(trimesh.Trimesh(vertices, mesh.faces if faces is None else faces, process=False))
 
 
-def test_what_needs_no_repair():
+def test_sound_meshes_keep_their_volume():
     assert volume(surface_of(box((0.1, 0.1, 0.1)))) == pytest.approx(CUBE)
     assert volume(surface_of(thin_box(0.1, 0.002))) == pytest.approx(CUBE - 0.096**3)
 
 
-def test_triangles_of_their_own_corners_are_joined():
-    """As a file of STL has them, and a little apart."""
+def test_triangles_with_separate_corners_are_joined():
+    """As STL files store them, and slightly apart."""
     mesh = box((0.1, 0.1, 0.1))
     noise = 1e-10 * np.random.default_rng(0).standard_normal((36, 3))
     apart = mesh.vertices[mesh.faces].reshape(-1, 3) + noise
@@ -37,12 +37,12 @@ def test_triangles_of_their_own_corners_are_joined():
     assert enclosed(vertices, faces) == pytest.approx(CUBE)
 
 
-def test_a_mesh_that_is_inside_out_is_turned_and_keeps_its_cavity():
+def test_an_inverted_mesh_is_flipped_and_keeps_its_cavity():
     mesh = thin_box(0.1, 0.002)
     assert volume(changed(mesh, faces=mesh.faces[:, ::-1])) == pytest.approx(CUBE - 0.096**3)
 
 
-def test_neighbours_that_disagree_are_turned_as_most_of_the_area_is():
+def test_inconsistent_neighbours_follow_the_majority_of_the_area():
     mesh = ball(0.05, subdivisions=2)
     faces = mesh.faces.copy()
     faces[:40] = faces[:40, ::-1]
@@ -57,8 +57,8 @@ def test_repeated_and_flat_triangles_are_dropped():
 
 def test_a_small_hole_is_closed():
     mesh = ball(0.05, subdivisions=3)
-    found = volume(changed(mesh, faces=mesh.faces[1:]))
-    assert found == pytest.approx(mesh.volume, rel=1e-4)
+    repaired = volume(changed(mesh, faces=mesh.faces[1:]))
+    assert repaired == pytest.approx(mesh.volume, rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -79,14 +79,14 @@ def test_a_small_hole_is_closed():
     ],
     ids=["no lid", "sheet", "flat", "not a number", "no area", "nothing"],
 )
-def test_what_has_no_inside(surface, message):
+def test_surfaces_without_an_inside_are_errors(surface, message):
     with pytest.raises(LowerError, match=message) as caught:
         closed(surface)
     assert caught.value.field == "modes"
 
 
 def test_a_shell_wound_like_the_outer_one_is_no_cavity():
-    """A screw in its hole is part of the body: only what is wound the other way round is a cavity."""
+    """A screw in its hole is part of the body: only a shell wound the other way is a cavity."""
     inside = trimesh.util.concatenate([box((0.1, 0.1, 0.1)), box((0.096, 0.096, 0.096))])
     assert volume(surface_of(inside)) == pytest.approx(CUBE + 0.096**3), "counted as often as it is wound around"
     assert volume(surface_of(hollow(box((0.1, 0.1, 0.1)), box((0.096, 0.096, 0.096))))) == pytest.approx(CUBE - 0.096**3)

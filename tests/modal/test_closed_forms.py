@@ -1,7 +1,7 @@
-"""Numbers of the closed forms of `oracles`, and modes of a body that is symmetric, or turned.
+"""The closed forms of `oracles` against textbooks, and modes of symmetric and of moved bodies.
 
-Wave numbers κ = ω L/c with c = √(E/ρ) and the longest side L of the bounding box. Quadratic elements give a little too much:
-tolerances are what their meshes leave, at most the 2 % asked for.
+Wave numbers κ = ω L/c use c = √(E/ρ) and the longest side L of the bounding box. Quadratic elements overestimate them a little:
+tolerances are the errors of their meshes, at most the required 2 %.
 """
 
 import numpy as np
@@ -17,10 +17,10 @@ def shared_cache(tmp_path_factory, monkeypatch):
     monkeypatch.setenv("TGDSL_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
 
 
-def test_closed_forms_have_the_textbooks_numbers():
-    """Timoshenko's beam is Bernoulli's where it is slender, and 15 % below at L/h = 8; the plate's a/h is 50.
+def test_closed_forms_match_textbooks():
+    """Timoshenko's beam equals Bernoulli's if slender, and is 15 % below at L/h = 8; the plate's a/h is 50.
 
-    Leissa's plate, by a shorter series, has 13.49, 19.79, 24.43 and 35.02; Lamb's roots are printed for these Poisson's ratios.
+    Leissa's shorter series gives 13.49, 19.79, 24.43 and 35.02 for the plate; Lamb's roots are printed for these Poisson's ratios.
     """
     beta = np.array([4.73004, 7.85320, 10.99561])
     assert roots(lambda b: np.cos(b) - 1 / np.cosh(b), 3.5, 12.0) == pytest.approx(beta, rel=1e-5)
@@ -32,22 +32,21 @@ def test_closed_forms_have_the_textbooks_numbers():
     assert [torsion(n, 5.0)[0] for n in (2, 3)] == pytest.approx([2.5011, 3.8647], abs=1e-4)
 
 
-def test_modes_of_one_frequency_are_one():
-    """Of a ball: spheroidal modes of degree 2, 1 and 3; torsion, 2.5011 c_s/a, is not heard."""
+def test_modes_of_one_frequency_are_merged():
+    """A ball has spheroidal modes of degree 2, 1 and 3; torsion, 2.5011 c_s/a, is inaudible."""
     shear = 1 / np.sqrt(2.6)
-    found, size, _ = spectrum(surface_of(ball(0.02)), 0.3, 22, 12_000)
+    modes, size, _ = spectrum(surface_of(ball(0.02)), 0.3, 22, 12_000)
     assert size == pytest.approx(0.04)
-    wanted = [2 * shear * lamb(n, 0.3, 6.0)[0] for n in (2, 1, 3)]
-    assert found.wave_number[:3] == pytest.approx(wanted, rel=3e-3)
-    assert found.multiplicity[:3].tolist() == [5, 3, 7]
-    assert np.abs(found.wave_number / (2 * shear * torsion(2, 4.0)[0]) - 1).min() > 0.02
+    expected = [2 * shear * lamb(n, 0.3, 6.0)[0] for n in (2, 1, 3)]
+    assert modes.wave_number[:3] == pytest.approx(expected, rel=3e-3)
+    assert modes.multiplicity[:3].tolist() == [5, 3, 7]
+    assert np.abs(modes.wave_number / (2 * shear * torsion(2, 4.0)[0]) - 1).min() > 0.02
 
 
-def test_a_body_that_is_turned_and_moved():
-    """Frequencies do not depend on where a body is in its frame, nor on how it is turned."""
-    found, _, _ = spectrum(surface_of(box((0.05, 0.03, 0.02))), 0.3, 6, 1000)
+def test_moving_a_body_keeps_its_frequencies():
+    modes, _, _ = spectrum(surface_of(box((0.05, 0.03, 0.02))), 0.3, 6, 1000)
     moved, _, middle = spectrum(surface_of(turned(box((0.05, 0.03, 0.02)), (0.3, 0.8, -0.4), (0.1, 0.2, 3.0))), 0.3, 6, 1000)
     size = np.ptp(turned(box((0.05, 0.03, 0.02)), (0.3, 0.8, -0.4), (0, 0, 0)).vertices, axis=0).max()
-    assert moved.wave_number / size == pytest.approx(found.wave_number / 0.05, rel=1e-6)
-    assert moved.gain == pytest.approx(found.gain, rel=1e-5)
+    assert moved.wave_number / size == pytest.approx(modes.wave_number / 0.05, rel=1e-6)
+    assert moved.gain == pytest.approx(modes.gain, rel=1e-5)
     assert middle == pytest.approx([0.1, 0.2, 3.0])

@@ -1,4 +1,4 @@
-"""Gains of modes of one frequency do not depend on which of their mixtures were found."""
+"""Gains of modes of one frequency do not depend on how the solver mixes them."""
 
 import numpy as np
 import pytest
@@ -12,8 +12,8 @@ def shapes(num: int = 6, points: int = 40) -> tuple[np.ndarray, np.ndarray]:
     return rng.standard_normal((points, num)), rng.uniform(0.5, 2.0, points)
 
 
-def share(found: Loudness, normal: np.ndarray) -> np.ndarray:
-    return of_groups(normal @ found.mixture, found.owner, len(found.gain))
+def share(result: Loudness, normal: np.ndarray) -> np.ndarray:
+    return of_groups(normal @ result.mixture, result.owner, len(result.gain))
 
 
 def test_groups():
@@ -26,7 +26,7 @@ def test_groups():
     assert groups(np.zeros(0)) == []
 
 
-def test_a_mixture_of_equal_modes_is_as_loud():
+def test_mixing_equal_modes_keeps_their_loudness():
     normal, area = shapes()
     wave_number = np.array([1.0, 1.0, 1.0, 2.0, 3.0, 4.0])
     first = loudness(wave_number, normal, area, 2.0)
@@ -45,20 +45,20 @@ def test_signs_do_not_depend_on_the_solver():
     assert share(flipped, -normal) == pytest.approx(share(loudness(wave_number, normal, area, 1.0), normal))
 
 
-def test_a_response_by_modal_coordinates():
-    """An impulse at a point, q̇ = φ(x) J for each mode: root mean squares over the surface, then over where it is struck."""
+def test_gains_match_a_response_in_modal_coordinates():
+    """An impulse at a point gives each mode q̇ = φ(x) J: root mean squares over the surface, then over the struck points."""
     normal, area = shapes()
     mass, equal = 3.0, slice(0, 3)
-    found = loudness(np.array([1.0, 1.0, 1.0, 2.0, 3.0, 4.0]), normal, area, mass)
+    result = loudness(np.array([1.0, 1.0, 1.0, 2.0, 3.0, 4.0]), normal, area, mass)
     velocity = normal[:, equal] @ normal[:, equal].T  # of y per impulse at x
     heard = np.sqrt(area @ velocity**2 / area.sum())
-    shares = share(found, normal)
-    assert found.gain[0] / mass * shares[:, 0] == pytest.approx(heard)
-    assert found.gain[0] / mass == pytest.approx(np.sqrt(area @ heard**2 / area.sum()))
+    shares = share(result, normal)
+    assert result.gain[0] / mass * shares[:, 0] == pytest.approx(heard)
+    assert result.gain[0] / mass == pytest.approx(np.sqrt(area @ heard**2 / area.sum()))
     assert np.sqrt(area @ shares**2 / area.sum()) == pytest.approx(np.ones(3))
 
 
-def test_what_does_not_move_along_its_normal_is_left_out():
+def test_modes_that_do_not_move_along_the_normal_are_dropped():
     normal, area = shapes()
     normal[:, 1] *= 1e-3
     assert loudness(np.arange(1.0, 7.0), normal, area, 1.0).wave_number == pytest.approx([1.0, 3.0, 4.0, 5.0])
