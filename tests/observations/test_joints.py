@@ -1,4 +1,4 @@
-"""Joint positions, velocities, efforts and the last action: names and order, and the way from a state to a policy."""
+"""Joint positions, velocities, efforts and the last action: names, order, and the path from state to policy."""
 
 import json
 
@@ -16,17 +16,17 @@ def rows_of(touch, names, kind="joints"):
     return [getattr(touch.inputs, kind).index(name) for name in names]
 
 
-def test_default_is_the_actuated_joints_in_the_order_of_the_actuators(tmp_path):
+def test_default_is_the_actuated_joints_in_actuator_order(tmp_path):
     touch = joint_module(tmp_path, {"policy": ALL})
     assert (touch.inputs.joints, touch.inputs.actuators) == (ACTUATED, ACTUATORS)
     assert touch.inputs.fields[-4:] == ("joint_pos", "joint_vel", "joint_effort", "last_action")
     state = touch.example_state(3)
     readings = touch(state)
-    wanted = torch.cat([state.joint_pos, state.joint_vel, state.joint_effort, state.last_action], dim=1)
-    assert (touch.observe(readings)["policy"] == wanted).all()
-    own = {output.name: output for output in touch.outputs[1:]}
-    assert {name: output.shape for name, output in own.items()} == dict.fromkeys(own, (3, 1))
-    assert [(o.rows, o.channels, o.units) for o in own.values()] == [
+    expected = torch.cat([state.joint_pos, state.joint_vel, state.joint_effort, state.last_action], dim=1)
+    assert (touch.observe(readings)["policy"] == expected).all()
+    terms = {output.name: output for output in touch.outputs[1:]}
+    assert {name: output.shape for name, output in terms.items()} == dict.fromkeys(terms, (3, 1))
+    assert [(o.rows, o.channels, o.units) for o in terms.values()] == [
         ("joint", ("position",), ("rad or m",)),
         ("joint", ("velocity",), ("rad/s or m/s",)),
         ("joint", ("effort",), ("N·m or N",)),
@@ -47,13 +47,13 @@ def test_default_is_the_actuated_joints_in_the_order_of_the_actuators(tmp_path):
     ],
 )
 def test_joints_by_name_and_wildcard(tmp_path, type_, joints, expected):
-    """Beside a group that wants all: the state's order is one, each term's its own."""
+    """With a second group of all joints: the state has one order, each term its own."""
     terms = {"policy": [{"type": type_, "joints": joints}], "all": [{"type": type_, "joints": ["*"]}]}
     touch = joint_module(tmp_path, terms)
     kind = "actuators" if type_ == "last_action" else "joints"
     state = touch.example_state(2)
-    found = touch.observe(touch(state))["policy"]
-    assert (found == getattr(state, type_)[:, rows_of(touch, expected, kind)]).all()
+    features = touch.observe(touch(state))["policy"]
+    assert (features == getattr(state, type_)[:, rows_of(touch, expected, kind)]).all()
     alone = joint_module(tmp_path, {"policy": terms["policy"]})
     assert set(getattr(alone.inputs, kind)) == set(expected)
     assert alone.observe(alone(alone.example_state(1)))["policy"].shape == (1, len(expected))
@@ -69,7 +69,7 @@ def test_joints_by_name_and_wildcard(tmp_path, type_, joints, expected):
         ({"type": "joint_pos", "joints": []}, "observations.policy[0].joints"),
     ],
 )  # fmt: skip
-def test_mistakes_are_told_where_they_are(tmp_path, term, message):
+def test_mistakes_name_their_place(tmp_path, term, message):
     with pytest.raises(SpecError) as caught:
         tgdsl.compile(joint_document(tmp_path, {"policy": [term]}))
     assert message in str(caught.value)
@@ -95,13 +95,13 @@ def test_an_actuator_without_a_name_is_a_mistake(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["joint_pos", "joint_vel", "joint_effort", "last_action"])
-def test_no_sensor_may_have_such_a_name(tmp_path, name):
+def test_sensors_may_not_take_the_names_of_joint_readings(tmp_path, name):
     sensor = {"kind": "contact_depth", "links": "*", "feels": ["item"]}
     with pytest.raises(SpecError, match=rf'sensors.{name}: "{name}" is the name of a reading that no sensor makes; give the'):
         tgdsl.compile(joint_document(tmp_path, {}, **{name: sensor}))
 
 
-def test_nobody_asks_and_nothing_is_wanted(tmp_path):
+def test_joint_inputs_are_required_only_on_request(tmp_path):
     touch = joint_module(tmp_path, {"policy": [{"type": "reading", "of": "dist"}]})
     assert not {"joint_pos", "joint_vel", "joint_effort", "last_action"} & {
         *touch.inputs.fields,
@@ -113,19 +113,19 @@ def test_nobody_asks_and_nothing_is_wanted(tmp_path):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_readings_are_of_the_modules_dtype_and_no_view_of_the_state(tmp_path, dtype):
+def test_readings_have_the_modules_dtype_and_do_not_alias_the_state(tmp_path, dtype):
     touch = joint_module(tmp_path, {"policy": ALL}, dtype)
     state = touch.example_state(2).to(torch.float32 if dtype == torch.float32 else torch.float64)
     readings = touch(state)
-    before = {name: readings[name].clone() for name in ("joint_pos", "last_action")}
-    for name, value in before.items():
+    copies = {name: readings[name].clone() for name in ("joint_pos", "last_action")}
+    for name, value in copies.items():
         assert value.dtype == dtype
         assert (value[:, :, 0] == getattr(state, name).to(dtype)).all()
         getattr(state, name).add_(1.0)
         assert (readings[name] == value).all()
 
 
-def test_a_state_without_them_is_an_error(tmp_path):
+def test_a_state_without_joints_is_an_error(tmp_path):
     touch = joint_module(tmp_path, {"policy": [{"type": "joint_pos"}]})
     state = touch.example_state(2)
     state.joint_pos = state.joint_pos[:, :2]
@@ -136,7 +136,7 @@ def test_a_state_without_them_is_an_error(tmp_path):
         touch(state)
 
 
-def test_saved_and_loaded_and_explained(tmp_path):
+def test_saving_loading_and_explaining(tmp_path):
     touch = joint_module(tmp_path, {"policy": [*ALL, {"type": "joint_pos", "joints": ["lift"]}]})
     tgdsl.save(touch, tmp_path / "a.safetensors")
     again = tgdsl.load(tmp_path / "a.safetensors", dtype=torch.float64)
@@ -154,7 +154,7 @@ def test_saved_and_loaded_and_explained(tmp_path):
 
 
 @pytest.mark.slow
-def test_compiled_is_eager(tmp_path):
+def test_compiled_equals_eager(tmp_path):
     touch = joint_module(tmp_path, {"policy": ALL}, torch.float32)
     state = touch.example_state(3)
     eager = touch.observe(touch(state))["policy"]
