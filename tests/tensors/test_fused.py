@@ -1,4 +1,4 @@
-"""Methods that are compiled from their second call on do what they do as they stand."""
+"""Methods compiled from their second call on return what they return uncompiled."""
 
 from functools import partial
 
@@ -10,12 +10,12 @@ from tgdsl.tensors.fused import FusedCall
 
 @pytest.fixture(autouse=True)
 def without_inductor(monkeypatch):
-    """Compile to graphs that are functional and run by torch: Inductor takes half a minute to begin."""
+    """Compile to functional graphs that torch runs: Inductor takes half a minute to start."""
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="aot_eager"))
 
 
 class Counter:
-    """Adds up what it is given in place, and makes what lasts at its first call."""
+    """Accumulates its argument in place; creates what lasts at the first call."""
 
     def __init__(self):
         self.total, self.calls, self.made = torch.zeros(5), 0, {}
@@ -29,14 +29,14 @@ class Counter:
 
 
 @pytest.mark.parametrize("is_compiled", [False, True])
-def test_calls_are_those_of_the_method(is_compiled):
-    one, other = Counter(), Counter()
-    add = FusedCall(one.add, is_compiled)
+def test_fused_calls_equal_the_method(is_compiled):
+    counter, expected = Counter(), Counter()
+    add = FusedCall(counter.add, is_compiled)
     for i in range(4):
         value = torch.arange(5.0) + i
-        torch.testing.assert_close(add(value, factor=2.0), other.add(value, factor=2.0))
-        torch.testing.assert_close(one.total, other.total)
-    assert one.calls == (1 if is_compiled else 4)
+        torch.testing.assert_close(add(value, factor=2.0), expected.add(value, factor=2.0))
+        torch.testing.assert_close(counter.total, expected.total)
+    assert counter.calls == (1 if is_compiled else 4)
 
 
 def test_shapes_may_differ_between_calls():

@@ -1,4 +1,4 @@
-"""The kernel of the links' products, by Triton's interpreter on the CPU, against products in float64."""
+"""The Triton kernel of the links' products, interpreted on the CPU, against products in float64."""
 
 import json
 import sys
@@ -34,15 +34,15 @@ CASES = {
 """Lines, taxels of the links, and planes."""
 
 
-def given(num_lines: int, sizes: list[int], num_planes: int) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """Return lines and matrices with both signs, as views of what holds two, some transposed."""
+def inputs(num_lines: int, sizes: list[int], num_planes: int) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """Return lines and matrices with both signs, as views into larger tensors, some transposed."""
     random = torch.Generator().manual_seed(num_lines)
     lines = torch.randn((num_lines, sum(sizes)), generator=random)
     matrices = [torch.randn((2, size, num_planes, size), generator=random)[1] for size in sizes]
     return lines, [matrix.transpose(0, 2) if i % 3 == 2 else matrix for i, matrix in enumerate(matrices)]
 
 
-def exact(lines: torch.Tensor, matrices: list[torch.Tensor]) -> torch.Tensor:
+def exact_products(lines: torch.Tensor, matrices: list[torch.Tensor]) -> torch.Tensor:
     """Return the products of all rows by one matrix for each plane, zero between links, in float64."""
     planes = [torch.block_diag(*(matrix[:, plane] for matrix in matrices)) for plane in range(matrices[0].shape[1])]
     return torch.stack([lines.double() @ plane.double() for plane in planes])
@@ -50,53 +50,53 @@ def exact(lines: torch.Tensor, matrices: list[torch.Tensor]) -> torch.Tensor:
 
 def errors() -> dict[str, float]:
     """Return the largest error of each case over its bound."""
-    found = {}
+    ratios = {}
     for name, case in CASES.items():
-        lines, matrices = given(*case)
-        error = (LINK_PRODUCTS(lines, matrices) - exact(lines, matrices)).abs()
+        lines, matrices = inputs(*case)
+        error = (LINK_PRODUCTS(lines, matrices) - exact_products(lines, matrices)).abs()
         # Each of n products and n sums rounds, by half of eps of what was added up.
-        bound = max(case[1]) * EPS * exact(lines.abs(), [matrix.abs() for matrix in matrices])
-        found[name] = float((error / bound.clamp(min=1e-30)).max())
-    return found
+        bound = max(case[1]) * EPS * exact_products(lines.abs(), [matrix.abs() for matrix in matrices])
+        ratios[name] = float((error / bound.clamp(min=1e-30)).max())
+    return ratios
 
 
 def edges() -> dict[str, list]:
-    """Return whether NaNs stay where they were, and the shape of the product of no lines."""
-    stays = []
+    """Return whether NaNs stay in place, and the shape of the product of zero lines."""
+    are_equal = []
     for last in (65, 140):
-        lines, matrices = given(70, [20, 33, 1, last], 2)
+        lines, matrices = inputs(70, [20, 33, 1, last], 2)
         lines[3, 30], lines[66, 53], lines[69, -1] = torch.nan, torch.nan, torch.nan
-        stays.append(torch.equal(LINK_PRODUCTS(lines, matrices).isnan(), products(lines, matrices).isnan()))
-    return {"not a number": stays, "no line": list(LINK_PRODUCTS(*given(0, [20, 99], 2)).shape)}
+        are_equal.append(torch.equal(LINK_PRODUCTS(lines, matrices).isnan(), products(lines, matrices).isnan()))
+    return {"not a number": are_equal, "no line": list(LINK_PRODUCTS(*inputs(0, [20, 99], 2)).shape)}
 
 
 @cache
-def found(function: str) -> dict:
-    """Return what a function of this file returns in a process that interprets kernels."""
+def results(function: str) -> dict:
+    """Return the result of a function of this file in a process that interprets kernels."""
     return json.loads(interpreted(__file__, function))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
-def test_kernel_is_the_product(name):
-    assert found("errors")[name] < 1
+def test_kernel_returns_the_product(name):
+    assert results("errors")[name] < 1
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_torch_code_is_the_product(name):
-    lines, matrices = given(*CASES[name])
+def test_torch_code_returns_the_product(name):
+    lines, matrices = inputs(*CASES[name])
     doubles = lines.double(), [matrix.double() for matrix in matrices]
-    torch.testing.assert_close(products(*doubles), exact(*doubles), rtol=1e-13, atol=1e-12)
+    torch.testing.assert_close(products(*doubles), exact_products(*doubles), rtol=1e-13, atol=1e-12)
 
 
 @pytest.mark.slow
-def test_not_a_number_stays_in_its_line_and_link():
-    assert found("edges")["not a number"] == [True, True]
+def test_nans_stay_in_their_line_and_link():
+    assert results("edges")["not a number"] == [True, True]
 
 
 @pytest.mark.slow
-def test_no_line_is_nothing():
-    assert found("edges")["no line"] == [2, 0, 119]
+def test_zero_lines_give_an_empty_product():
+    assert results("edges")["no line"] == [2, 0, 119]
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""When a Triton kernel stands in for torch's operations."""
+"""When a Triton kernel replaces torch's operations."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from tgdsl.tensors import operations
 
 
 class OnGpu(torch.Tensor):
-    """A tensor that says it is on a GPU."""
+    """A tensor that claims to be on a GPU."""
 
     is_cuda = property(lambda self: True)  # type: ignore[assignment]
 
@@ -27,13 +27,13 @@ def test_a_kernel_takes_float32_on_a_gpu():
 
 @pytest.mark.parametrize("place", range(3))
 @pytest.mark.parametrize("other", [torch.zeros(2), on_gpu(torch.float64), on_gpu(requires_grad=True)])
-def test_one_tensor_that_it_cannot_take_is_enough(place, other):
-    """Whichever it is: on the host, of another dtype, or one whose derivatives are asked for."""
+def test_one_unsupported_tensor_rules_out_the_kernel(place, other):
+    """One on the host, of another dtype, or that requires gradients."""
     tensors = [on_gpu() for _ in range(3)]
     tensors[place] = other
     assert not operations.are_kernel_inputs(*tensors)
 
 
-def test_derivatives_that_nobody_asks_for_are_no_hindrance():
+def test_requires_grad_does_not_matter_under_no_grad():
     with torch.no_grad():
         assert operations.are_kernel_inputs(on_gpu(requires_grad=True), on_gpu())

@@ -8,13 +8,13 @@ from tgdsl.tensors.on_host import one_thread
 
 @pytest.fixture
 def three_threads():
-    before = torch.get_num_threads()
+    num_threads = torch.get_num_threads()
     torch.set_num_threads(3)
     yield
-    torch.set_num_threads(before)
+    torch.set_num_threads(num_threads)
 
 
-def test_afterwards_there_are_as_many_threads_as_before(three_threads):
+def test_one_thread_restores_the_number_of_threads(three_threads):
     with one_thread():
         assert torch.get_num_threads() == 1
     assert torch.get_num_threads() == 3
