@@ -19,7 +19,7 @@ from tgdsl.testing import KindConformance
 
 @pytest.fixture(autouse=True)
 def shared_cache(tmp_path_factory, monkeypatch):
-    """Fields whose errors are measured at few points, kept for all tests of this file."""
+    """Fields with errors measured at few points, shared by all tests of this file."""
     monkeypatch.setenv("TGDSL_CACHE", str(tmp_path_factory.getbasetemp() / "coarse"))
     monkeypatch.setattr(moment_fields, "CHOICE_POINTS", 200)
     monkeypatch.setattr(moment_fields, "REPORT_POINTS", 200)
@@ -28,7 +28,7 @@ def shared_cache(tmp_path_factory, monkeypatch):
 class TestProximity(KindConformance):
     kind = PROXIMITY
     parameters = {"tolerance": 0.1}
-    test_compiled_equals_eager = None  # its graph is part of that of all kinds in `test_compiled.py`
+    test_compiled_equals_eager = None  # `test_compiled.py` compiles all kinds, this one too, as one graph
     gates = ()
 
 
@@ -47,14 +47,14 @@ class TestProximityOverPointsAsInThePaper(KindConformance):
 class TestProximityOfOneRadius(KindConformance):
     kind = PROXIMITY
     parameters = {"tolerance": 0.1, "radius": 0.006}
-    test_compiled_equals_eager = None  # its graph is that of the first of these kinds
+    test_compiled_equals_eager = None  # its graph equals that of `TestProximity`
     gates = ()
 
 
 class TestProximityAsInThePaper(KindConformance):
     kind = PROXIMITY
     parameters = {"tolerance": 0.1, "model": "paper", "outputs": ["force"], "reference_area": 0.01}
-    test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
+    test_compiled_equals_eager = None  # its graph is part of another kind's
     gates = ()
 
 
@@ -62,10 +62,10 @@ SIDES = (proximity.plane_in_front, *(partial(proximity.plane_at_the_side, about)
 
 
 @pytest.mark.parametrize("compare", SIDES)
-def test_a_plane_by_hand(compare):
-    """In front it pushes the sensor back, at the side it twists it; the paper's pulls."""
-    found = compare()
-    assert found.paper_error > found.magnitude
+def test_forces_of_a_plane_match_hand_calculations(compare):
+    """A plane in front pushes the sensor back, one at the side twists it; the paper's model pulls."""
+    comparison = compare()
+    assert comparison.paper_error > comparison.magnitude
 
 
 def test_the_papers_model_pulls():
@@ -75,31 +75,31 @@ def test_the_papers_model_pulls():
 
 
 def test_slip_drags_the_sensor_along_with_the_object():
-    """A cube that slides: f_t = k_s ρ S0 v_t, and the velocity along the normal does nothing."""
+    """A sliding cube: f_t = k_s ρ S0 v_t; velocity along the normal has no effect."""
     s0 = -read(BOX, pos=[0, 0, -0.026])[2] / (300 * RHO)
     assert s0 == pytest.approx(proximity.over_a_plane(0.006), rel=0.1)
 
 
-def turning(touch, spin, drift, **item):
+def rotating_state(touch, spin, drift, **item):
     """Return a state in which link and object turn as one rigid body."""
-    found = state(touch, **item)
-    assert found.body_pos is not None and found.body_angvel is not None and found.body_linvel is not None
+    scene = state(touch, **item)
+    assert scene.body_pos is not None and scene.body_angvel is not None and scene.body_linvel is not None
     for i in range(2):
-        found.body_angvel[0, i] = torch.tensor(spin)
-        found.body_linvel[0, i] = torch.tensor(drift + np.cross(spin, found.body_pos[0, i].numpy()))
-    return found
+        scene.body_angvel[0, i] = torch.tensor(spin)
+        scene.body_linvel[0, i] = torch.tensor(drift + np.cross(spin, scene.body_pos[0, i].numpy()))
+    return scene
 
 
-def test_a_hand_that_turns_with_the_object_feels_slip_only_in_the_paper(tmp_path):
-    """The paper's slip is then ω × S1 with the absolute ω, here in the frame of the link."""
+def test_joint_rotation_is_slip_only_in_the_papers_model(tmp_path):
+    """The paper's slip is then ω × S1 with the absolute ω, in the link's frame."""
     spin, at = np.array([1.0, -2.0, 0.5]), {"pos": [0, 0, -0.026]}
     for model, slips in (("tgdsl", 0.0), ("paper", 1.0)):
         touch = module(
             tmp_path, [(0.004, 0, 0)], BOX, gate=None, kind="proximity", model=model, tolerance=COARSE, reference_area=AREA
         )
         still = touch(state(touch, **at))["s"][0, 0].numpy()
-        moving = touch(turning(touch, spin, np.array([0.3, 0.1, -0.2]), **at))["s"][0, 0].numpy()
-        # S1 is known of the torque at rest but for its part along the normal; the cube's middle is below the probe.
+        moving = touch(rotating_state(touch, spin, np.array([0.3, 0.1, -0.2]), **at))["s"][0, 0].numpy()
+        # The torque at rest gives S1 except along the normal; the cube's middle is below the probe.
         sign = 1.0 if model == "paper" else -1.0
         s1 = np.array([-still[4], still[3], 0]) * sign / (300 * RHO)
         depth = ((moving - still)[0] / (10 * RHO) + spin[2] * s1[1]) / spin[1] if slips else 0.0
@@ -110,19 +110,19 @@ def test_a_hand_that_turns_with_the_object_feels_slip_only_in_the_paper(tmp_path
 
 
 def test_the_whole_area_is_the_default_reference():
-    own = read(BOX, sensor={"reference_area": None}, pos=[0, 0, -0.026])
-    np.testing.assert_allclose(own, read(BOX, pos=[0, 0, -0.026]), rtol=1e-6, atol=1e-15)
+    readings = read(BOX, sensor={"reference_area": None}, pos=[0, 0, -0.026])
+    np.testing.assert_allclose(readings, read(BOX, pos=[0, 0, -0.026]), rtol=1e-6, atol=1e-15)
 
 
 def test_points_and_field_agree_to_sampling_noise(tmp_path):
-    """100,000 points, some 3,200 of them within reach, err by √(1.5 / 3200) = 2.2 %; the field by less."""
+    """Of 100,000 points some 3,200 are within reach: they err by √(1.5 / 3200) = 2.2 %; the field errs by less."""
     line = np.linspace(-0.02, 0.02, 6)
     probes = [(x, y, 0) for x in line for y in line]
-    found = []
+    readings = []
     for sensor in ({"tolerance": 0.02}, {"backend": "points", "points": 100_000, "max_bytes": 2**29}):
         touch = module(tmp_path, probes, BOX, gate=None, kind="proximity", reference_area=AREA, **sensor)
-        found.append(touch(state(touch, pos=[0.003, 0, -0.025]))["s"][0].numpy())
-    assert np.sqrt(np.mean((found[0] - found[1]) ** 2, axis=0)[2]) < 0.025 * np.abs(found[1][:, 2]).max()
+        readings.append(touch(state(touch, pos=[0.003, 0, -0.025]))["s"][0].numpy())
+    assert np.sqrt(np.mean((readings[0] - readings[1]) ** 2, axis=0)[2]) < 0.025 * np.abs(readings[1][:, 2]).max()
 
 
 def test_the_mean_does_not_depend_on_the_number_of_taxels(tmp_path):
@@ -151,24 +151,24 @@ def test_each_radius_has_its_own_field(tmp_path):
     for radii in ((0.01, 0.006), (0.01,), (0.006,)):
         (tmp_path / "scene.xml").write_text(SCENE)
         points = [{"pos": [0, 0, 0], "normal": [0, 0, 1], "radius": r} for r in radii]
-        own = tgdsl.compile(document(tmp_path, points), dtype=torch.float64)
-        readings = own(state(own, pos=[0.004, 0, -0.023]))["s"][0]
+        compiled = tgdsl.compile(document(tmp_path, points), dtype=torch.float64)
+        readings = compiled(state(compiled, pos=[0.004, 0, -0.023]))["s"][0]
         (alone if len(radii) == 1 else touch).append(readings)
     torch.testing.assert_close(touch[0], torch.cat(alone))
     assert (touch[0][:, 2] < 0).all()
 
 
-def test_a_radius_replaces_that_of_the_layout_for_one_sensor():
-    """Over a plane each sensor has the closed form of its own radius; a taxel that is inactive in the layout reads nothing."""
+def test_a_sensors_radius_overrides_the_layouts():
+    """Over a plane each sensor matches the closed form for its radius; a taxel that the layout disables reads zero."""
     plane = {"kind": "proximity", "links": "pad", "feels": ["floor"], "reference_area": AREA}
-    with folder() as where:
-        whole = document(where, [{**POINT, "radius": 0.004}, {**POINT, "radius": 0.0}])
-        whole["sensors"] = {
+    with folder() as path:
+        spec = document(path, [{**POINT, "radius": 0.004}, {**POINT, "radius": 0.0}])
+        spec["sensors"] = {
             "s": plane,
             "wide": {**plane, "radius": "10 mm"},
             "points": {**plane, "radius": 0.007, "backend": "points"},
         }
-        touch = tgdsl.compile(whole, dtype=torch.float64)
+        touch = tgdsl.compile(spec, dtype=torch.float64)
     above = state(touch)
     above.body_pos[0, touch.inputs.bodies.index("pad"), 2] = 0.003
     readings = touch(above)
@@ -200,17 +200,17 @@ POINT = {"pos": [0, 0, 0], "normal": [0, 0, 1], "radius": R}
 
 
 @pytest.mark.parametrize("backend", ["field", "points"])
-def test_variants_are_as_many_single_runs(tmp_path, backend):
+def test_variants_equal_single_objects(tmp_path, backend):
     variants = [{"type": "box", "size": [0.02] * 3}, {"type": "sphere", "size": [0.02]}]
-    own = {"backend": backend} | ({"points": 500} if backend == "points" else {})
-    touch = tgdsl.compile(document(tmp_path, [POINT], target={"variants": variants}, **own), dtype=torch.float64)
+    options = {"backend": backend} | ({"points": 500} if backend == "points" else {})
+    touch = tgdsl.compile(document(tmp_path, [POINT], target={"variants": variants}, **options), dtype=torch.float64)
     at = touch.example_state(4, spread=0.004)
     assert at.body_pos is not None and at.variant is not None
     at.body_pos[:, touch.inputs.bodies.index("item"), 2] -= 0.024
     together = touch(at)["s"]
     for env in range(4):
         target = {"geom": variants[int(at.variant[env, 0])]}
-        alone = tgdsl.compile(document(tmp_path, [POINT], target=target, **own), dtype=torch.float64)
+        alone = tgdsl.compile(document(tmp_path, [POINT], target=target, **options), dtype=torch.float64)
         values = {name: getattr(at, name)[env : env + 1] for name in alone.inputs.fields}
         torch.testing.assert_close(alone(SceneState(**values))["s"][0], together[env], rtol=1e-12, atol=1e-15)
     assert (together[:, 0, :3].abs().sum(dim=1) > 0).sum() >= 3
@@ -232,8 +232,8 @@ def test_mistakes(tmp_path, changes, message):
     assert len(error.value.problems) == 1, str(error.value)
 
 
-def test_only_moments_are_found(tmp_path):
-    """No distances are baked or measured for it, and the account says what the field costs."""
+def test_only_moments_are_computed(tmp_path):
+    """No distances are baked or measured; `explain` states the cost of the field."""
     touch = tgdsl.compile(document(tmp_path, [POINT], outputs=["torque"]))
     assert touch.inputs.fields == ("body_pos", "body_quat") and "contact_depth" not in touch.plan.quantities
     text = touch.explain()
@@ -250,8 +250,8 @@ SOLIDS = {
 
 
 @pytest.mark.parametrize("shape", SOLIDS)
-def test_density_is_shared_out_over_the_points(tmp_path, shape):
-    """A ball that holds the whole object weighs every point: ρ S0 = density times the mean of R − |p − q|, whatever the area."""
+def test_density_is_divided_among_the_points(tmp_path, shape):
+    """A ball around the whole object weighs every point: ρ S0 = density times the mean of R − |p − q|, whatever the area."""
     geom, area = SOLIDS[shape]
     sensor = {"backend": "points", "points": 300, "outputs": ["force"], "reference_area": None, "normal_stiffness": 1.0}
     touch = module(tmp_path, [(0, 0, 0)], geom, radius=0.06, gate=None, kind="proximity", **sensor)
@@ -260,12 +260,12 @@ def test_density_is_shared_out_over_the_points(tmp_path, shape):
     points = table.surface.points.T[:300]
     place = np.array([0.001, -0.002, 0.003])
     mean = np.mean(0.06 - np.linalg.norm(points + place, axis=1))
-    found = touch(state(touch, pos=place.tolist()))["s"][0, 0, 2]
-    assert float(found) == pytest.approx(-100 * mean, rel=1e-12)
+    force = touch(state(touch, pos=place.tolist()))["s"][0, 0, 2]
+    assert float(force) == pytest.approx(-100 * mean, rel=1e-12)
 
 
 def test_explain_counts_the_bytes_of_all_channels(tmp_path):
-    """With noise of the radius a field holds derivatives too: 8 numbers of 4 bytes at each node."""
+    """With radius noise a field holds derivatives too: 8 numbers of 4 bytes at each node."""
     cases: list[tuple[dict[str, Any], int]] = [({}, 4), ({"noise": {"radius_noise": 1e-3}}, 8)]
     for noise, channels in cases:
         touch = module(tmp_path, [(0, 0, 0)], BOX, gate=None, kind="proximity", tolerance=0.1, **noise)

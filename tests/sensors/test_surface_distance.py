@@ -10,7 +10,7 @@ class TestSurfaceDistance(KindConformance):
     kind = SURFACE_DISTANCE
     rest = 0.05
     gates = ()
-    test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
+    test_compiled_equals_eager = None  # its graph is part of another kind's
 
 
 class TestSurfaceDistanceWithVectors(KindConformance):
@@ -41,7 +41,7 @@ def test_the_vector_is_in_the_links_frame(tmp_path):
     np.testing.assert_allclose(touch(scene)["s"][0, 0].numpy(), [0.01, 0, -0.01, 0], atol=1e-15)
 
 
-def test_the_radius_has_no_effect_but_to_switch_a_probe_off(tmp_path):
+def test_the_radius_only_switches_probes_off(tmp_path):
     for radius, expected in ((0.001, 0.01), (0.02, 0.01), (0.0, 0.05)):
         touch = module(tmp_path, [(0.03, 0, 0)], BOX, gate=None, kind="surface_distance", radius=radius)
         np.testing.assert_allclose(touch(state(touch))["s"].item(), expected, atol=1e-15)

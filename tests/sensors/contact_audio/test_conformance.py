@@ -1,4 +1,4 @@
-"""The suite that every kind passes, for samples and bands, links and objects, and the paper's response."""
+"""The conformance suite for samples and bands, links and objects, and the paper's response."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ COMMON = {"modes": MODES, "timestep": 0.002, "samples": 8, "scrape": 0.05}
 class TestSamples(KindConformance):
     kind = CONTACT_AUDIO
     test_taxel_permutation_commutes = None  # it reads no taxels
-    test_compiled_equals_eager = None  # its graph is part of that of blocks, below
+    test_compiled_equals_eager = None  # `TestSubsteps` below has a graph that includes this one
     parameters = COMMON
     gates = ()
     num_steps = 4
@@ -47,7 +47,7 @@ class TestSamples(KindConformance):
             assert (module(state)["s"] == 0).all()
 
     def test_a_broken_pose_is_seen(self, scene):
-        """A force that is none, or a velocity, comes out as not-a-number."""
+        """Invalid forces or velocities give NaN."""
         for name in ("contact_force", *(["body_linvel"] if self.parameters["scrape"] else [])):
             module, _ = self.build(self.document(scene), torch.float32)
             state = module.example_state(2)
@@ -62,7 +62,7 @@ class TestWithoutNoise(TestSamples):
     float64_tolerance = KindConformance.float64_tolerance
 
     def test_something_is_felt(self, scene):
-        """The first load is steady; what the next ones add strikes once it no longer grows."""
+        """The first load is steady; later additions strike once they stop growing."""
         module, _ = self.build(self.document(scene), torch.float64)
         readings = [module(state)["s"] for state in self.states(module)]
         assert (readings[0] == 0).all()
@@ -77,7 +77,7 @@ class TestBands(TestSamples):
     parameters = {**COMMON, "outputs": "bands"}
 
     def test_something_is_felt(self, scene):
-        """310, 845 and 1520 Hz are in the third octaves of 316, 794 and 1585 Hz, and those between are empty."""
+        """310, 845 and 1520 Hz lie in the third octaves of 316, 794 and 1585 Hz; those between are empty."""
         module, _ = self.build(self.document(scene), torch.float64)
         assert module.outputs[0].channels == tuple(f"band_{f}" for f in (316, 398, 501, 631, 794, 1000, 1259, 1585))
         for state in self.states(module):
@@ -115,8 +115,8 @@ class TestPaper(TestSamples):
 
 
 @pytest.mark.parametrize("other", [1e-3, 3.1e-3])
-def test_another_time_step_is_the_references_too(tmp_path, other):
-    """Matrices are made again when calls come faster or slower than was compiled for, and again when they do as before."""
+def test_another_time_step_matches_the_reference(tmp_path, other):
+    """Matrices are rebuilt when the call rate departs from the compiled one, and when it returns."""
     (tmp_path / "scene.xml").write_text(SCENE)
     suite = TestWithoutNoise()
     module, reference = suite.build(suite.document(tmp_path / "scene.xml"), torch.float64)
@@ -125,17 +125,17 @@ def test_another_time_step_is_the_references_too(tmp_path, other):
         state.dt = step
         if i == 1:
             with pytest.warns(UserWarning, match=rf"compiled for 1 steps of 0.002 s per call.* counts steps of {other:g} s"):
-                found = module(state)["s"]
+                readings = module(state)["s"]
         else:
-            found = module(state)["s"]
-        assert_agrees(found, reference, state, 1e-12)
+            readings = module(state)["s"]
+        assert_agrees(readings, reference, state, 1e-12)
 
 
 NOTHING = Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros(0, np.int64), ())
 
 
 def shaped(name, surface, given, below, progress):
-    """Modes of no body in particular: on a grid of 3 × 2 × 4 nodes, turned in its frame; two fields of the second mode."""
+    """Modes of no particular body: on a turned grid of 3 × 2 × 4 nodes; the second mode has two fields."""
     rng = np.random.default_rng(len(name))
     axes = Rotation.random(random_state=len(name)).as_matrix()
     low, step, num = np.array([-0.05, -0.04, -0.06]), np.array([0.05, 0.09, 0.04]), np.array([3, 2, 4])

@@ -1,4 +1,4 @@
-"""What documents may say of contact audio, and what is wrong with them: places, names, and what would be right."""
+"""Contact audio in documents, and its mistakes: their places, names and corrections."""
 
 import dataclasses
 
@@ -35,13 +35,13 @@ HIGH = [{"frequency": 30000.0, "decay": 10.0}, {"frequency": 40000.0, "decay": 1
         ({"noise": {"white_noise": 1e-3}}, '"contact_audio" has no knob "white_noise"'),
     ],
 )
-def test_mistakes_are_named_where_they_are(tmp_path, given, message):
+def test_mistakes_name_their_place(tmp_path, given, message):
     with pytest.raises(SpecError) as caught:
         plate(tmp_path, **given)
     assert message in str(caught.value)
 
 
-def test_the_number_of_samples_that_is_named_suffices(tmp_path):
+def test_the_suggested_number_of_samples_suffices(tmp_path):
     with pytest.warns(UserWarning, match="plate: a mode is left out, 40000 Hz: the sample rate is 67000 Hz"):
         touch = plate(tmp_path, modes=HIGH, samples=67)
     assert touch.outputs[0].shape == (67, 1, 1)
@@ -49,8 +49,8 @@ def test_the_number_of_samples_that_is_named_suffices(tmp_path):
         plate(tmp_path, modes=HIGH, samples=66)
 
 
-def test_modes_that_are_not_heard_are_dropped_by_name(tmp_path):
-    """They are warned of, an account lists them, and the sound is that of the others."""
+def test_inaudible_modes_are_dropped_by_name(tmp_path):
+    """A warning and `explain` name them; the sound comes from the others."""
     with pytest.warns(UserWarning, match="contact audio of plate: a mode is left out, 2903 Hz: the sample rate is 6000 Hz"):
         touch = plate(tmp_path, samples=6, scrape=0)
     fewer = plate(tmp_path, samples=6, scrape=0, modes=MODES[:2])
@@ -61,26 +61,26 @@ def test_modes_that_are_not_heard_are_dropped_by_name(tmp_path):
         torch.testing.assert_close(touch(state)["s"], fewer(state)["s"], rtol=0, atol=0)
 
 
-def test_the_loudest_modes_are_those_of_most_energy(tmp_path):
-    """As if they alone were listed: g²/4d is 1, 2, 0.9 and 0.25 · 10⁻³ s/kg²."""
+def test_the_loudest_modes_have_the_most_energy(tmp_path):
+    """As if only they were listed: g²/4d is 1, 2, 0.9 and 0.25 · 10⁻³ s/kg²."""
     listed = [
         {"frequency": 300.0, "decay": 250.0, "gain": 1.0},
         {"frequency": 500.0, "decay": 500.0, "gain": -2.0},
         {"frequency": 800.0, "decay": 25.0, "gain": 0.3},
         {"frequency": 1300.0, "decay": 1000.0, "gain": 1.0},
     ]
-    energy = [own["gain"] ** 2 / (4 * own["decay"]) for own in listed]
+    energy = [mode["gain"] ** 2 / (4 * mode["decay"]) for mode in listed]
     for count in (1, 2, 3):
-        chosen = sorted(sorted(range(4), key=lambda i: -energy[i])[:count])
+        indices = sorted(sorted(range(4), key=lambda i: -energy[i])[:count])
         few = plate(tmp_path, modes=listed, loudest=count, scrape=0)
-        alone = plate(tmp_path, modes=[listed[i] for i in chosen], scrape=0)
+        alone = plate(tmp_path, modes=[listed[i] for i in indices], scrape=0)
         for force in (0.0, 2.0, 0.0, 0.0):
             state = pressed(few, [force])
             torch.testing.assert_close(few(state)["s"], alone(state)["s"], rtol=0, atol=0)
 
 
-def test_bands_are_the_same_whatever_is_left_out(tmp_path):
-    """The bands of modes that are not computed stay, silent."""
+def test_bands_do_not_depend_on_dropped_modes(tmp_path):
+    """Bands of modes that are not computed remain, silent."""
     every, one = (plate(tmp_path, outputs="bands", loudest=count, scrape=0, substeps=1) for count in (None, 1))
     assert every.outputs[0].channels == one.outputs[0].channels
     for force in (0.0, 2.0, 0.0):
@@ -91,37 +91,37 @@ def test_bands_are_the_same_whatever_is_left_out(tmp_path):
     torch.testing.assert_close(few[is_kept], heard[is_kept], rtol=1e-6, atol=0)
 
 
-def test_bodies_have_modes_of_their_own(tmp_path):
-    """By name or wildcard; the first that matches counts."""
-    own = {"oth*": MODES[:1], "*": MODES[1:]}
-    touch = plate(tmp_path, links=["plate", "other"], bodies=own)
+def test_bodies_may_have_different_modes(tmp_path):
+    """By name or wildcard; the first match counts."""
+    modes_of_bodies = {"oth*": MODES[:1], "*": MODES[1:]}
+    touch = plate(tmp_path, links=["plate", "other"], bodies=modes_of_bodies)
     frequency = touch.plan.sensors[0].constants["frequency"]
     np.testing.assert_array_equal(frequency, [[1171.0, 2903.0], [523.0, 0.0]])
 
 
 @pytest.mark.parametrize("of", ["link", "object"])
 def test_a_shape_is_analysed_in_its_bodys_frame(tmp_path, monkeypatch, of):
-    """Modal analysis gets the surface of what rings, and up to where modes are heard."""
-    asked = []
+    """Modal analysis gets the surface of the ringing body and the highest audible frequency."""
+    calls = []
 
     def analysed(name, surface, given, below, progress):
-        asked.append((name, np.ptp(surface.vertices, axis=0).round(6).tolist(), given.material.name, below))
+        calls.append((name, np.ptp(surface.vertices, axis=0).round(6).tolist(), given.material.name, below))
         return Modes(np.array([700.0]), np.array([3.0]), np.array([1.0]))
 
     monkeypatch.setattr(analysis, "analysed", analysed)
     touch = plate(tmp_path, modes="steel", of=of)
     assert touch.plan.sensors[0].constants["frequency"].tolist() == [[700.0]]
     size = [0.2, 0.2, 0.01] if of == "link" else [0.02, 0.02, 0.02]
-    assert asked == [("plate" if of == "link" else "ball", size, "steel", pytest.approx(7200.0))]
+    assert calls == [("plate" if of == "link" else "ball", size, "steel", pytest.approx(7200.0))]
 
 
-def test_the_time_step_is_the_scenes_unless_it_is_given(tmp_path):
-    scene, own = plate(tmp_path), plate(tmp_path, timestep="4 ms", samples=32)
-    assert (scene.inputs.dt, own.inputs.dt) == (0.001, 0.004)
-    assert (scene.example_state(1).dt, own.example_state(1).dt) == (0.001, 0.004)
+def test_the_time_step_defaults_to_the_scenes(tmp_path):
+    scene, custom = plate(tmp_path), plate(tmp_path, timestep="4 ms", samples=32)
+    assert (scene.inputs.dt, custom.inputs.dt) == (0.001, 0.004)
+    assert (scene.example_state(1).dt, custom.example_state(1).dt) == (0.001, 0.004)
 
 
-def test_a_simulation_of_other_substeps_is_refused_or_warned_of(tmp_path):
+def test_a_simulation_with_other_substeps_is_refused_or_warned_about(tmp_path):
     touch = plate(tmp_path, substeps=5)
     with pytest.raises(SimulationError, match="simulate with substeps=5"):
         tgdsl.simulate(touch, 1, substeps=2).step()
@@ -132,7 +132,7 @@ def test_a_simulation_of_other_substeps_is_refused_or_warned_of(tmp_path):
         once(sim.state())
 
 
-def test_an_artefact_sounds_as_what_was_compiled(tmp_path):
+def test_a_loaded_artefact_sounds_the_same(tmp_path):
     touch = plate(tmp_path)
     tgdsl.save(touch, tmp_path / "plate.safetensors")
     again = tgdsl.load(tmp_path / "plate.safetensors", dtype=torch.float64)
@@ -141,18 +141,18 @@ def test_an_artefact_sounds_as_what_was_compiled(tmp_path):
         assert torch.equal(touch(state)["s"], again(state)["s"])
 
 
-def test_some_environments_are_read_alone(tmp_path):
-    """A mask reads and strikes those alone; the others go on where they were."""
+def test_some_environments_can_be_read_alone(tmp_path):
+    """A mask reads and strikes only its environments; the others stay where they were."""
     touch, whole = plate(tmp_path), plate(tmp_path)
     states = [pressed(touch, [force] * 3, 0.2) for force in (0.0, 3.0, 1.0, 0.5)]
     for state in states[:2]:
         touch(state), whole(state)
-    before = touch(states[2])["s"].clone()
+    previous = touch(states[2])["s"].clone()
     mask = torch.tensor([False, True, False])
     some = touch(states[3], mask=mask)["s"]
     whole(states[2])
     expected = whole(states[3])["s"]
-    assert torch.equal(some[[0, 2]], before[[0, 2]])
+    assert torch.equal(some[[0, 2]], previous[[0, 2]])
     torch.testing.assert_close(some[1], expected[1], rtol=0, atol=1e-15)
 
 
@@ -164,8 +164,8 @@ def test_a_policy_observes_bands(tmp_path):
     assert touch.observe(touch(state))["policy"].shape == (3, 2 * len(touch.outputs[0].channels))
 
 
-def test_alike_objects_that_share_a_body_strike_a_link_once(tmp_path):
-    """Two objects of one body: their force is one to the link, and each of them rings itself."""
+def test_objects_that_share_a_body_strike_a_link_once(tmp_path):
+    """Two objects of one body exert one force on the link."""
     document = plate_document(tmp_path, scrape=0)
     document["objects"]["same"] = {"body": "ball"}
     document["sensors"]["s"]["feels"] = ["ball", "same"]

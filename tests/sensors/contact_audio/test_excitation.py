@@ -1,4 +1,4 @@
-"""What strikes: impulses of collisions, however many steps they take, and the noise of sliding."""
+"""Excitation: impulses of collisions over any number of steps, and the noise of sliding."""
 
 import math
 
@@ -17,13 +17,13 @@ def test_twice_the_force_sounds_twice_as_loud(tmp_path):
 
 
 def test_a_steady_load_makes_no_sound(tmp_path):
-    """Neither one that is there when an episode begins, nor one that has settled, nor one that lets go."""
-    found = sound(plate(tmp_path, scrape=0), [5.0, *[5.0] * 20, *[0.0] * 20])
-    assert not found.any()
+    """Neither a load present from the start, nor a settled one, nor its release."""
+    signal = sound(plate(tmp_path, scrape=0), [5.0, *[5.0] * 20, *[0.0] * 20])
+    assert not signal.any()
 
 
 def test_a_slow_load_hardly_sounds(tmp_path):
-    """A load that rises for 0.15 s strikes once it no longer rises, with R τ²; as a blow of a step ΔF it would with ΔF Δt."""
+    """A load that rises for 0.15 s strikes once it stops rising, with R τ²; a blow ΔF of one step would strike with ΔF Δt."""
     rate = 200.0
     loads = np.minimum(np.arange(200) * STEP, 0.15) * rate
     impulse, last = struck(plate(tmp_path, modes=MODE, scrape=0), loads, MODE[0]["decay"])
@@ -31,31 +31,31 @@ def test_a_slow_load_hardly_sounds(tmp_path):
     assert 150 <= last <= 153
 
 
-def test_the_next_collision_is_heard_for_itself(tmp_path):
-    """A ball that bounces: two blows 30 ms apart, on a plate that carries another load throughout."""
+def test_successive_collisions_are_heard_separately(tmp_path):
+    """A bouncing ball: two blows 30 ms apart, on a plate under another, constant load."""
     touch = plate(tmp_path, modes=MODE, samples=16, scrape=0)
     forces = np.full(80, 2.0)
     forces[10] += 8.0
     forces[40] += 4.0
-    found = sound(touch, forces)[0]
-    time = np.arange(1, len(found) + 1) * STEP / 16
+    signal = sound(touch, forces)[0]
+    time = np.arange(1, len(signal) + 1) * STEP / 16
     waves = [
         j * np.exp(-10 * np.maximum(time - t, 0)) * np.sin(2000 * math.pi * (time - t)) * (time >= t)
         for j, t in ((8e-3, 11e-3), (4e-3, 41e-3))
     ]
-    np.testing.assert_allclose(found, sum(waves), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(signal, sum(waves), rtol=0, atol=1e-12)
 
 
-def test_scraping_is_ten_decibels_louder_by_ten_times_the_force_or_the_speed(tmp_path):
+def test_ten_times_the_force_or_the_speed_scrapes_ten_decibels_louder(tmp_path):
     """The noise is the same; `oracles.sound.scraping` compares its level."""
     touch = [plate(tmp_path, modes=MODE, scrape=1e-3) for _ in RUBS]
-    heard = [sound(own, np.full((5, 4), force), speed) for own, (force, speed) in zip(touch, RUBS, strict=True)]
-    level = [10 * np.log10((own**2).mean()) for own in heard]
+    heard = [sound(each, np.full((5, 4), force), speed) for each, (force, speed) in zip(touch, RUBS, strict=True)]
+    level = [10 * np.log10((each**2).mean()) for each in heard]
     np.testing.assert_allclose(np.array(level[1:]) - level[0], 10, atol=1e-9)
 
 
-def test_the_spectrum_of_scraping_is_that_of_the_modes(tmp_path):
-    """The noise itself is white: two modes of the same decay and gain are as loud, a low one and one near the end."""
+def test_scraping_has_the_spectrum_of_the_modes(tmp_path):
+    """The noise is white: a low and a high mode of the same decay and gain are equally loud."""
     modes = [{"frequency": f, "decay": 300.0, "gain": 1.0} for f in (400.0, 4100.0)]
     touch = plate(tmp_path, modes=modes, samples=10, scrape=1e-3)
     heard = sound(touch, np.full((90, 400), 1.0), 0.5)[:, 300:]
@@ -65,8 +65,8 @@ def test_the_spectrum_of_scraping_is_that_of_the_modes(tmp_path):
     assert 0.85 < low / high < 1.18
 
 
-def test_environments_scrape_differently_and_whatever_their_number(tmp_path):
-    """Counted random numbers: those of an environment do not depend on how many there are; a seed gives the same again."""
+def test_scraping_differs_between_environments_whatever_their_number(tmp_path):
+    """Random numbers are counted: those of an environment do not depend on how many there are; a seed repeats them."""
     force = np.full((5, 4), 2.0)
     four, two, again, other = (
         sound(plate(tmp_path).seed(seed), force[:, :count], 0.3) for seed, count in ((7, 4), (7, 2), (7, 4), (8, 4))
@@ -77,8 +77,8 @@ def test_environments_scrape_differently_and_whatever_their_number(tmp_path):
     assert abs(correlation - np.eye(8)).max() < 0.9
 
 
-def test_two_links_or_objects_are_struck_apart(tmp_path):
-    """The other plate is silent; of objects the ball rings, whichever plate it strikes."""
+def test_only_the_struck_link_or_object_sounds(tmp_path):
+    """The other plate is silent; with `of: object` the ball rings, whichever plate it strikes."""
     touch = plate(tmp_path, links=["plate", "other"], modes=MODE, scrape=0)
     heard = torch.cat([touch(pressed(touch, [f]))["s"] for f in (0.0, 3.0, 0.0)], dim=1)[0, :, :, 0]
     assert touch.rows["s"]["body"].tolist() == ["plate", "other"]

@@ -1,4 +1,4 @@
-"""`model: force`: modes that the history of the contact force drives, against momentum, closed forms and SciPy's ODEs."""
+"""`model: force`: modes driven by the history of the contact force, against momentum, closed forms and SciPy's ODEs."""
 
 import math
 
@@ -25,14 +25,14 @@ THROWN = """
 
 
 def phasors(touch):
-    """Return the plate's phasors now, (env, mode) [N·s]."""
+    """Return the plate's current phasors (env, mode) [N·s]."""
     real, imag = touch.memory.get_buffer("s:phasors")[:, 0].double().numpy().reshape(touch.num_envs, 2, -1).swapaxes(0, 1)
     return real + 1j * imag
 
 
 @pytest.mark.parametrize(("step", "solref"), [(0.002, "0.02 1"), (0.001, "0.004 1"), (0.0005, "0.004 1")])
-def test_a_strike_is_the_momentum_that_it_changes(tmp_path, step, solref):
-    """A mode of 1 Hz, slow to contacts of up to 40 ms: its amplitude is m Δv of a ball that MuJoCo throws on the plate."""
+def test_a_strikes_amplitude_is_its_change_of_momentum(tmp_path, step, solref):
+    """A 1 Hz mode is slow next to contacts of up to 40 ms: its amplitude is m Δv of a ball that MuJoCo throws on the plate."""
     (tmp_path / "thrown.xml").write_text(THROWN.format(step=step, solref=solref))
     modes = [{"frequency": 1.0, "decay": 0.01}]
     touch = tgdsl.compile(
@@ -56,16 +56,16 @@ def test_a_strike_is_the_momentum_that_it_changes(tmp_path, step, solref):
     assert np.abs(phasors(touch)) * math.exp(0.01 * 0.06) == pytest.approx(impulse, rel=0.01)
 
 
-def test_a_force_that_is_linear_between_samples_is_exact_at_any_step(tmp_path):
-    """In steps of 2 ms and of 0.2 ms the same phasors and samples, to 1e-12 of the largest."""
+def test_a_piecewise_linear_force_is_exact_at_any_step(tmp_path):
+    """Steps of 2 ms and of 0.2 ms give the same phasors and samples, to 1e-12 of the largest."""
     corners = np.random.default_rng(0).uniform(0, 5, 12)
-    found = []
+    results = []
     for num in (1, 10):
         touch = plate(tmp_path, samples=20 // num, timestep=0.002 / num, **FORCE)
         forces = np.interp(np.arange(11 * num + 1) / num, np.arange(12), corners)
         heard = sound(touch, forces, step=0.002 / num)[0]
-        found.append((phasors(touch)[0], heard[20 // num :]))
-    for coarse, fine in zip(*found, strict=True):
+        results.append((phasors(touch)[0], heard[20 // num :]))
+    for coarse, fine in zip(*results, strict=True):
         np.testing.assert_allclose(fine, coarse, rtol=0, atol=1e-12 * np.abs(coarse).max())
 
 
@@ -85,7 +85,7 @@ def test_samples_are_velocities_of_driven_oscillators(tmp_path):
 
 
 def test_a_half_sine_converges_to_its_closed_form(tmp_path):
-    """∫ sin(at) e^(λ(T−t)) dt = a (1 + e^(λT))/(λ² + a²), a = π/T: to second order in the step."""
+    """∫ sin(at) e^(λ(T−t)) dt = a (1 + e^(λT))/(λ² + a²), a = π/T; convergence in the step is of second order."""
     duration, errors = 0.004, []
     a = math.pi / duration
     exact = a * (1 + np.exp(RATES * duration)) / (RATES**2 + a**2)
@@ -100,25 +100,25 @@ def test_a_half_sine_converges_to_its_closed_form(tmp_path):
 
 @pytest.mark.parametrize("frequency", [20.0, 300.0, 700.0, 1400.0, 2500.0])
 def test_a_contact_excites_a_mode_by_its_spectrum(tmp_path, frequency):
-    """A triangle of force, 1 ms up and 1 ms down, of 3e-3 N·s: J sinc²(f Δt); one kilohertz and its multiples are silent."""
+    """A triangle of force, 1 ms up and 1 ms down, of 3e-3 N·s: J sinc²(f Δt); multiples of one kilohertz are silent."""
     touch = plate(tmp_path, modes=[{"frequency": frequency, "decay": 1e-6}], samples=10, **FORCE)
-    found = amplitudes(touch, [0.0, 3.0, 0.0])[-1, 0]
-    assert found == pytest.approx(3e-3 * np.sinc(frequency * STEP) ** 2, rel=1e-5)
+    amplitude = amplitudes(touch, [0.0, 3.0, 0.0])[-1, 0]
+    assert amplitude == pytest.approx(3e-3 * np.sinc(frequency * STEP) ** 2, rel=1e-5)
 
 
 def test_a_steady_force_adds_nothing(tmp_path):
-    """Not the first of an episode; after a rise z decays freely, with e^(λΔt) per step, however large the force."""
+    """Nor does the first force of an episode; after a rise z decays freely, with e^(λΔt) per step, at any force."""
     touch = plate(tmp_path, samples=16, **FORCE)
     assert not sound(touch, [5.0] * 20).any()
     sound(touch, [0.0])
-    before = phasors(touch)
+    previous = phasors(touch)
     for _ in range(30):
         sound(touch, [0.0])
         np.testing.assert_allclose(
-            phasors(touch), before * np.exp(RATES * STEP), rtol=0, atol=1e-12 * np.abs(before).max() + 2e-12
+            phasors(touch), previous * np.exp(RATES * STEP), rtol=0, atol=1e-12 * np.abs(previous).max() + 2e-12
         )
-        before = phasors(touch)
-    assert np.abs(before).min() > 1e-6
+        previous = phasors(touch)
+    assert np.abs(previous).min() > 1e-6
 
 
 def test_twice_the_force_sounds_twice_as_loud_in_float32(tmp_path):
@@ -126,8 +126,8 @@ def test_twice_the_force_sounds_twice_as_loud_in_float32(tmp_path):
     np.testing.assert_allclose(two, 2 * one, rtol=0, atol=1e-6 * np.abs(two).max())
 
 
-def test_a_new_episode_forgets_the_force(tmp_path):
-    """Of two environments under load the one that is reset is silent when its first force is another."""
+def test_a_reset_forgets_the_force(tmp_path):
+    """Of two environments under load, the reset one is silent when its first force differs."""
     touch = plate(tmp_path, **FORCE)
     for load in (0.0, 3.0):
         touch(pressed(touch, [load] * 2))

@@ -1,4 +1,4 @@
-"""Documents that name a material: their bodies' modes are those of their shape, as MuJoCo has it."""
+"""Documents that name a material: a body's modes follow from its shape in MuJoCo."""
 
 import numpy as np
 import pytest
@@ -40,42 +40,42 @@ def shared_cache(tmp_path_factory, monkeypatch):
 
 def document(folder, mesh: trimesh.Trimesh, **sensor) -> dict:
     mesh.export(folder / "case.stl")
-    found = plate_document(folder, of="object", **sensor)
+    spec = plate_document(folder, of="object", **sensor)
     (folder / "plate.xml").write_text(SCENE.format(file=folder / "case.stl", walls=WALLS))
-    found["objects"] = {name: {"body": name} for name in ("walls", "case")}
-    found["sensors"]["s"]["feels"] = ["walls", "case"]
-    return found
+    spec["objects"] = {name: {"body": name} for name in ("walls", "case")}
+    spec["sensors"]["s"]["feels"] = ["walls", "case"]
+    return spec
 
 
 def test_thin_walled_boxes_of_geoms_and_of_a_mesh(tmp_path):
-    """Six slabs, and a mesh with an inner shell, which MuJoCo collides as its hull: both ring as the box with a cavity."""
+    """Six slabs, and a mesh with an inner shell that MuJoCo collides as its hull: both ring like the box with a cavity."""
     touch = tgdsl.compile(document(tmp_path, thin_box(SIDE, WALL), modes=STEEL, samples=64))
     planned = touch.plan.sensors[0].constants
-    wanted = analysed("box", surface_of(thin_box(SIDE, WALL)), ShapeModes(material="steel", count=6), 0.45 * 64_000)
-    assert len(wanted.frequency) >= 4
+    expected = analysed("box", surface_of(thin_box(SIDE, WALL)), ShapeModes(material="steel", count=6), 0.45 * 64_000)
+    assert len(expected.frequency) >= 4
     for row, tolerance in ((0, 1e-6), (1, 1e-5)):  # coordinates of a mesh are float32
-        num = len(wanted.frequency)
-        assert planned["frequency"][row, :num] == pytest.approx(wanted.frequency, rel=tolerance)
+        num = len(expected.frequency)
+        assert planned["frequency"][row, :num] == pytest.approx(expected.frequency, rel=tolerance)
 
 
-def test_materials_are_told_apart_by_pitch_and_decay(tmp_path):
-    """Bodies alike but for what they are made of: wood is lower than steel, and dies away sooner."""
+def test_materials_differ_in_pitch_and_decay(tmp_path):
+    """Bodies that differ only in material: wood is lower than steel and decays faster."""
     modes = {"bodies": {"case": "wood"}, "modes": STEEL, "samples": 32}
     planned = tgdsl.compile(document(tmp_path, thin_box(SIDE, WALL), **modes)).plan.sensors[0].constants
     assert planned["frequency"][1, 0] < 0.5 * planned["frequency"][0, 0]
     assert (planned["frequency"] > 0).sum(axis=1).min() >= 4
 
 
-def test_a_mesh_without_an_inside_is_a_mistake_of_the_document(tmp_path):
+def test_a_mesh_without_an_inside_is_a_mistake(tmp_path):
     mesh = box((SIDE, SIDE, SIDE))
     mesh.update_faces(np.arange(12) > 1)
-    found = document(tmp_path, mesh, modes=STEEL)
+    spec = document(tmp_path, mesh, modes=STEEL)
     text = (tmp_path / "plate.xml").read_text().replace('inertia="exact"', 'inertia="shell"')
     (tmp_path / "plate.xml").write_text(text)
     with pytest.raises(SpecError, match=r'sensors\.s\.modes: modes of "case": geom "case" is open: \d+ mm of edges'):
-        tgdsl.compile(found)
+        tgdsl.compile(spec)
 
 
-def test_a_material_that_does_not_ring(tmp_path):
+def test_a_material_that_does_not_ring_is_a_mistake(tmp_path):
     with pytest.raises(SpecError, match=r'sensors\.s\.modes: modes of "plate": skin has no Young\'s modulus'):
         tgdsl.compile({**plate_document(tmp_path, modes="skin")})

@@ -1,4 +1,4 @@
-"""The example of a noisy hand: it runs from the command line, and each line of it does what its comment says."""
+"""The noisy-hand example runs from the command line, and each line does what its comment says."""
 
 from pathlib import Path
 
@@ -46,16 +46,16 @@ def test_it_runs_from_the_command_line(here, tmp_path):
         assert archive["worn"].shape == (5, 1, 3, 199, 6)
 
 
-def test_every_observation_type_of_the_paper_is_there(touch):
+def test_the_example_has_every_observation_type_of_the_paper(touch):
     types = {term.type for term in touch.plan.observations}
-    known = {part.model_fields["type"].annotation.__args__[0] for part in ObservationSpec.__origin__.__args__}
-    of_the_hand = {"taxel_counts", "taxel_saturated", "joint_pos", "joint_vel", "joint_effort", "last_action"}
-    assert types == known - {"none", "link_bool", "link_force", "reading", "cop"} - of_the_hand
+    all_types = {part.model_fields["type"].annotation.__args__[0] for part in ObservationSpec.__origin__.__args__}
+    hand_types = {"taxel_counts", "taxel_saturated", "joint_pos", "joint_vel", "joint_effort", "last_action"}
+    assert types == all_types - {"none", "link_bool", "link_force", "reading", "cop"} - hand_types
 
 
 @pytest.mark.slow
-def test_the_clean_reading_is_that_of_a_clean_sensor(touch, readings):
-    """`touch/clean` is what the same document reads with `readout: clean`; the measured one differs where something is felt."""
+def test_the_clean_reading_equals_a_clean_sensors(touch, readings):
+    """`touch/clean` equals the reading of a document with `readout: clean`; measured readings differ wherever there is contact."""
     clean = tgdsl.compile(EXAMPLE, overrides={"sensors": CLEAN, "observations": "{}"})
     sim = tgdsl.simulate(clean, NUM_ENVS, substeps=5, keyframe="squeeze")
     controls = scripted_controls(sim.model, ("squeeze",), 0.01 * NUM_STEPS, sim.control_step)
@@ -70,8 +70,8 @@ CLEAN = "{touch: {kind: kinematic_taxel, links: hand, feels: [cube], noise: nois
 
 
 @pytest.mark.slow
-def test_readings_are_of_the_quantisers_steps(touch, readings):
-    """Steps of the paper's table: 0.1 mm, 0.01 N and 0.1 mm; where `worn` says so, none on the palm."""
+def test_readings_are_multiples_of_the_quantisers_step(touch, readings):
+    """Steps of the paper's table: 0.1 mm, 0.01 N and 0.1 mm; on the palm `worn` has none."""
     for name, step in {"depth": 1e-4, "touch": 1e-2, "near": 1e-2, "skin": 1e-4}.items():
         share = readings[name].double() / step
         assert (share - share.round()).abs().max() < 1e-3, name
@@ -83,8 +83,8 @@ def test_readings_are_of_the_quantisers_steps(touch, readings):
 
 
 @pytest.mark.slow
-def test_the_skin_takes_a_sample_at_every_second_call(readings):
-    """50 Hz read every 10 ms: each value stands twice, and then changes."""
+def test_the_skin_samples_at_every_second_call(readings):
+    """50 Hz read every 10 ms: each value appears twice, then changes."""
     skin = readings["skin"]
     torch.testing.assert_close(skin[1::2], skin[0::2], rtol=0, atol=0)
     assert (skin[2::2] != skin[1:-1:2]).flatten(1).any(dim=1).all()
@@ -125,8 +125,8 @@ def test_a_picture_of_stacked_readings_can_be_drawn(stacked, tmp_path):
     assert picture(module, sim, readings, tmp_path / "picture.png").exists()
 
 
-def test_a_quantity_is_an_objects_own_even_if_its_name_ends_like_an_axis(tmp_path):
-    """`distance_cube` is not what is read of the object `cube_x`, and `distance_cube_x` is."""
+def test_names_of_objects_may_end_like_an_axis(tmp_path):
+    """The quantity of the object `cube_x` is `distance_cube_x`, not `distance_cube`."""
     (tmp_path / "scene.xml").write_text(SCENE)
     points = {"method": "points", "points": [{"pos": [0, 0, 0.01], "normal": [0, 0, 1], "radius": 0.004}]}
     sensor = {"kind": "surface_distance", "links": "pad", "feels": ["cube_x"], "max_range": 0.1, "readout": "both"}

@@ -9,7 +9,7 @@ def test_hysteresis_changes_the_signal():
     assert np.abs(comparison.exact - np.interp(comparison.at, *filters.PRESS)).max() > 0.3
 
 
-def test_the_papers_hysteresis_is_not():
+def test_the_papers_hysteresis_depends_on_the_time_step():
     curves = [filters.maxwell_cycle(k).paper for k in (1, 2, 10)]
     assert np.abs(curves[0] - curves[1]).max() > 0.02
     assert np.abs(curves[0] - curves[2]).max() > 0.04

@@ -1,7 +1,7 @@
 """The order of stages, resets, and what passes gradients.
 
-Numbers are counted, so a stage alone disturbs as it does among others: two stages are one after the other, and not the other
-way round. Pairs that commute are not here: gain and hysteresis, gain and delay, delay and what is constant.
+Draws are counted, so a stage disturbs alone as it does among others: two stages apply in one order, not the other.
+Pairs that commute are left out: gain and hysteresis, gain and delay, delay and constants.
 """
 
 from typing import Any
@@ -48,34 +48,34 @@ def test_the_order_of_stages(pair):
     both = make([a | b for a, b in zip(first, second, strict=True)])
     alone = make(first), make(second)
     swapped = make(second), make(first)
-    rng, off, in_order = np.random.default_rng(3), 0.0, 0.0
+    rng, swapped_error, ordered_error = np.random.default_rng(3), 0.0, 0.0
     for call in range(30):
         if call == 15:
             for noise in (both, *alone, *swapped):
                 noise.reset(1)
         signal = rng.normal(0, 1, (3, 6, 1))
-        found = both.read(signal, DT)
-        in_order = max(in_order, float((found - alone[1].read(alone[0].read(signal, DT), DT)).abs().max()))
-        off = max(off, float((found - swapped[1].read(swapped[0].read(signal, DT), DT)).abs().max()))
-    assert in_order < EXACT
-    assert off > 0.05
+        readings = both.read(signal, DT)
+        ordered_error = max(ordered_error, float((readings - alone[1].read(alone[0].read(signal, DT), DT)).abs().max()))
+        swapped_error = max(swapped_error, float((readings - swapped[1].read(swapped[0].read(signal, DT), DT)).abs().max()))
+    assert ordered_error < EXACT
+    assert swapped_error > 0.05
 
 
-def test_a_dead_taxel_reads_the_same_whatever_it_feels():
+def test_a_dead_taxel_ignores_its_signal():
     noise = Noise({**ALL_TOGETHER, "dead_probability": 1.0, "quantization": 0.3}, 6, CHANNELS, num_envs=3, dt=DT)
     first = noise.read(5.0, DT)
     for call in range(5):
         assert torch.equal(noise.read(float(call), DT), first)
 
 
-def test_after_a_reset_the_reading_begins_at_the_true_value():
+def test_the_first_reading_after_a_reset_is_the_true_value():
     filters = {key: ALL_TOGETHER[key] for key in ("hysteresis", "read_delay", "jitter")}
     noise = Noise(filters, 3, CHANNELS, num_envs=3, dt=DT)
     for call in range(12):
         noise.read(float(call % 3), DT)
     noise.reset([0, 2])
-    found = noise.read(22.0, DT)
-    assert (found[[0, 2]] == 22).all() and (found[1] != 22).all()
+    reading = noise.read(22.0, DT)
+    assert (reading[[0, 2]] == 22).all() and (reading[1] != 22).all()
     assert (noise.read(22.0, DT)[[0, 2]] == 22).all()
 
 

@@ -1,4 +1,4 @@
-"""A stage of noise that is not tgdsl's own: in documents, modules, artefacts and definitions like any other."""
+"""A third-party noise stage in documents, modules, artefacts and definitions."""
 
 import dataclasses
 import importlib.util
@@ -41,8 +41,8 @@ KNOBS = {"bias": {"force": 0.3}, "saturation": {"force": [0.2, 0.4]}, "quantizat
 
 @pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_module_clips_between_offset_and_quantiser(tmp_path, saturation, compiled):
-    made = {"s": {"noise": KNOBS}, "c": {"noise": {name: v for name, v in KNOBS.items() if name != "saturation"}}}
-    touch = tgdsl.compile(pads(tmp_path, made), dtype=torch.float64)
+    sensors = {"s": {"noise": KNOBS}, "c": {"noise": {name: v for name, v in KNOBS.items() if name != "saturation"}}}
+    touch = tgdsl.compile(pads(tmp_path, sensors), dtype=torch.float64)
     assert touch.plan.sensors[0].noise.terms == ("bias", "saturation", "quantization")
     assert "saturation force [0.2, 0.4] N" in touch.explain()
     if compiled:
@@ -57,7 +57,7 @@ def test_a_module_clips_between_offset_and_quantiser(tmp_path, saturation, compi
     assert torch.equal(clipped[..., 3:], other[..., 3:])
 
 
-def test_the_batched_form_is_as_defined(saturation, monkeypatch):
+def test_the_batched_form_matches_the_definition(saturation, monkeypatch):
     monkeypatch.setattr("oracles.setups.signals.Knobs", noise_model((saturation.Knobs,)).plain)
     noise = Noise({name: value for name, value in KNOBS.items() if name != "like"}, 5, ("force_x",), num_envs=3)
     signal = np.linspace(-1, 1, 5)[:, None]
@@ -66,7 +66,7 @@ def test_the_batched_form_is_as_defined(saturation, monkeypatch):
     assert np.abs(expected).max() <= 0.4 + 1e-3
 
 
-def test_profiles_links_and_artefacts_have_it(tmp_path, saturation, monkeypatch):
+def test_profiles_links_and_artefacts_accept_the_stage(tmp_path, saturation, monkeypatch):
     profiles = {"mine": {"saturation": 0.1, "links": {"palm": {"saturation": 0.5}}}}
     touch = tgdsl.compile(document(tmp_path, "kinematic_taxel", "mine", profiles))
     values = touch.plan.arrays["sensors/s/noise/saturation"]
@@ -79,30 +79,30 @@ def test_profiles_links_and_artefacts_have_it(tmp_path, saturation, monkeypatch)
         tgdsl.load(tmp_path / "touch.safetensors")
 
 
-def test_mistakes_in_its_knobs_are_at_their_places(tmp_path, saturation):
-    (what,) = mistakes(tmp_path, "kinematic_taxel", {"saturation": -1})
-    assert what == "sensors.s.noise.saturation: -1 is out of range, expected at least 0"
-    (what,) = mistakes(tmp_path, "contact_depth", {"saturation": {"force": 1}})
-    assert what == 'sensors.s.noise: "saturation" names "force", which this sensor does not read'
-    (what,) = mistakes(tmp_path, "contact_audio", {"saturation": 1})
-    assert what == 'sensors.s.noise.saturation: "contact_audio" has no knob "saturation"'
+def test_mistakes_in_its_knobs_name_their_place(tmp_path, saturation):
+    (message,) = mistakes(tmp_path, "kinematic_taxel", {"saturation": -1})
+    assert message == "sensors.s.noise.saturation: -1 is out of range, expected at least 0"
+    (message,) = mistakes(tmp_path, "contact_depth", {"saturation": {"force": 1}})
+    assert message == 'sensors.s.noise: "saturation" names "force", which this sensor does not read'
+    (message,) = mistakes(tmp_path, "contact_audio", {"saturation": 1})
+    assert message == 'sensors.s.noise.saturation: "contact_audio" has no knob "saturation"'
     assert "saturation" in json_schema()["$defs"]["NoiseSpec"]["properties"]
 
 
-def test_without_it_the_knob_is_unknown(tmp_path):
-    (what,) = mistakes(tmp_path, "kinematic_taxel", {"saturation": 1})
-    assert what == 'sensors.s.noise.saturation: unknown key "saturation"'
+def test_the_knob_is_unknown_without_the_stage(tmp_path):
+    (message,) = mistakes(tmp_path, "kinematic_taxel", {"saturation": 1})
+    assert message == 'sensors.s.noise.saturation: unknown key "saturation"'
     assert "saturation" not in NoiseSpec.model_fields
 
 
-def test_a_stage_with_the_draw_of_another(saturation, tmp_path, monkeypatch):
+def test_two_stages_with_the_same_draw_are_an_error(saturation, tmp_path, monkeypatch):
     number = dataclasses.replace(saturation.numbers["saturation"], draw=12)
     monkeypatch.setattr(saturation, "numbers", {"saturation": number})
     with pytest.raises(TgdslError, match=r'the noise stages "quantization" and "saturation" both have the draw 12'):
         tgdsl.compile(document(tmp_path, "contact_depth", {}))
 
 
-def test_an_installed_stage_is_there_without_being_registered(tmp_path, monkeypatch):
+def test_an_installed_stage_needs_no_registration(tmp_path, monkeypatch):
     with installing(tmp_path, monkeypatch, pipeline.REGISTRY.group, FILE.read_text()) as install:
         install("clips", "1.0", saturation="clips:Saturation")
         touch = tgdsl.compile(document(tmp_path, "kinematic_taxel", {"saturation": 0.1}))

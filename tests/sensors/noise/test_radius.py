@@ -14,10 +14,10 @@ from tgdsl.testing import only
 from tgdsl.testing.reference import full_scale_error
 
 
-def test_a_disturbed_radius_is_another_radius(build, tmp_path):
-    """Depths are exactly those of a module that is compiled with the radii that were drawn."""
+def test_a_disturbed_radius_acts_like_another_radius(build, tmp_path):
+    """Depths equal exactly those of a module compiled with the drawn radii."""
     touch = build(s={"kind": "contact_depth", "noise": {"radius_noise": 2e-3}})
-    made, drawn, num_felt = document(tmp_path, {"s": {"kind": "contact_depth"}}), [], 0
+    spec, drawn, num_felt = document(tmp_path, {"s": {"kind": "contact_depth"}}), [], 0
     for call in range(4):
         state = felt_state(touch, 2, call)
         memory = touch.memory.tensors(2, None, touch.dtype, touch.device)
@@ -29,9 +29,9 @@ def test_a_disturbed_radius_is_another_radius(build, tmp_path):
         drawn.append(shift)
         for env in range(2):
             for link, first in (("pad", 0), ("tip", 12)):
-                for i, point in enumerate(made["robot"]["layout"]["resolutions"]["r"][link]["points"]):
+                for i, point in enumerate(spec["robot"]["layout"]["resolutions"]["r"][link]["points"]):
                     point["radius"] = 4e-3 + shift[env, first + i].item()
-            expected = tgdsl.compile(made, dtype=torch.float64)(only(state, slice(env, env + 1)))["s"]
+            expected = tgdsl.compile(spec, dtype=torch.float64)(only(state, slice(env, env + 1)))["s"]
             torch.testing.assert_close(readings[env : env + 1], expected, rtol=1e-12, atol=1e-17)
             num_felt += int(expected.count_nonzero())
     assert num_felt > 5
@@ -41,7 +41,7 @@ def test_a_disturbed_radius_is_another_radius(build, tmp_path):
 
 
 def test_a_radius_is_never_negative(build):
-    """R̃ = max(0, R + ε): where R is gone a probe still reads how deep its centre is, as max(0, R̃ − φ) says."""
+    """R̃ = max(0, R + ε): at R̃ = 0 a probe still reads the depth of its centre, by max(0, R̃ − φ)."""
     touch = build(s={"kind": "contact_depth", "gate": "geometric", "noise": {"radius_noise": 0.02}, "readout": "both"})
     state = touch.example_state(40, spread=0.01)
     readings = touch(state)
@@ -53,26 +53,26 @@ def test_a_radius_is_never_negative(build):
 
 
 RADIUS_ERRORS = {"points": 1e-12, "field": 0.1}
-"""Largest error over full scale at R ± ρ, against a module that is compiled with that radius."""
+"""Largest error over full scale at R ± ρ, against a module compiled with that radius."""
 
 
 @pytest.mark.parametrize("backend", ["points", "field"])
 def test_radius_noise_of_proximity(tmp_path, monkeypatch, backend):
     fields = {"points": 1000} if backend == "points" else {"tolerance": 0.02}
-    made = document(tmp_path, {"s": {"kind": "proximity", "backend": backend, **fields}})
+    spec = document(tmp_path, {"s": {"kind": "proximity", "backend": backend, **fields}})
     (tmp_path / "scene.xml").write_text(SCENE.replace('type="sphere" size=".025"', 'type="box" size=".01 .01 .01"'))
 
-    def of_radius(radius: float, noise: dict) -> TactileModule:
-        for own in made["robot"]["layout"]["resolutions"]["r"].values():
-            own["radius"] = radius
-        made["sensors"]["s"]["noise"] = noise
-        return tgdsl.compile(made, dtype=torch.float64)
+    def compiled(radius: float, noise: dict) -> TactileModule:
+        for link_layout in spec["robot"]["layout"]["resolutions"]["r"].values():
+            link_layout["radius"] = radius
+        spec["sensors"]["s"]["noise"] = noise
+        return tgdsl.compile(spec, dtype=torch.float64)
 
-    touch = of_radius(0.01, {"radius_noise": "0.6 mm"})
+    touch = compiled(0.01, {"radius_noise": "0.6 mm"})
     state = felt_state(touch, 100)
     for sign in (1, -1):
-        exact = of_radius(0.01 + sign * 6e-4, {})
-        if backend == "points":  # which points there are depends on the radius; the law is compared on the same ones
+        exact = compiled(0.01 + sign * 6e-4, {})
+        if backend == "points":  # points depend on the radius; the law is compared on the same ones
             moments = dataclasses.replace(exact.plan.quantities["moments"], tables=touch.plan.quantities["moments"].tables)
             plan = dataclasses.replace(exact.plan, quantities={**exact.plan.quantities, "moments": moments})
             exact = TactileModule(plan, dtype=torch.float64)
@@ -82,8 +82,8 @@ def test_radius_noise_of_proximity(tmp_path, monkeypatch, backend):
         assert error.max() < RADIUS_ERRORS[backend]
 
 
-def test_the_clean_reading_of_points_is_that_of_a_sensor_without_noise(build):
-    """Radius noise of the measured reading leaves the clean one alone: the object is sampled in the same points."""
+def test_the_clean_reading_of_points_equals_a_sensors_without_noise(build):
+    """Radius noise leaves the clean reading alone: it samples the object at the same points."""
     sensor = {"kind": "proximity", "backend": "points", "points": 200}
     both, clean = build(s={**sensor, "noise": {"radius_noise": "0.6 mm"}, "readout": "both"}), build(s=sensor)
     for a, b in zip(read(both, range(3)), read(clean, range(3)), strict=True):

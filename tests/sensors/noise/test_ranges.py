@@ -1,4 +1,4 @@
-"""Knobs that are ranges: each environment draws its own value at a reset."""
+"""Knobs given as ranges: each environment draws its own value at a reset."""
 
 import numpy as np
 import pytest
@@ -28,12 +28,12 @@ RANGES = {
     "dead_probability": ([0.1, 0.4], {"dead_probability": (0.1, 0.4), "dead_low": None}),
     "dead_range": ([[-4, -3], [5, 7]], {"dead_low": (-4, -3), "dead_high": (5, 7), "dead_probability": None}),
 }
-"""A range of each knob, and the ends of what is drawn; None: a plain number that comes with it."""
+"""A range of each knob and the bounds of its draws; None: a plain number that comes with it."""
 
 
 @pytest.mark.parametrize("knob", RANGES)
 def test_each_environment_draws_its_own_at_reset(tmp_path, knob):
-    """What stages are given is inside the range, differs between environments, stays, and changes at reset where it should."""
+    """Draws lie in the range, differ between environments, persist, and change where an environment is reset."""
     value, expected = RANGES[knob]
     noise = {knob: value, **({"dead_probability": 0.5} if knob == "dead_range" else {})}
     touch = tgdsl.compile(document(tmp_path, "kinematic_taxel", noise), dtype=torch.float64)
@@ -51,7 +51,7 @@ def test_each_environment_draws_its_own_at_reset(tmp_path, knob):
     first, second = drawn(), drawn()
     touch.reset([3, 7])
     third = drawn()
-    others = [env for env in range(num_envs) if env not in (3, 7)]
+    untouched = [env for env in range(num_envs) if env not in (3, 7)]
     for name, ends in expected.items():
         assert torch.equal(first[name], second[name])
         if ends is None:
@@ -61,21 +61,21 @@ def test_each_environment_draws_its_own_at_reset(tmp_path, knob):
         assert len(first[name].unique()) == num_envs
         assert low <= first[name].min() < low + 0.1 * (high - low)  # P(no one of 200 there) = 7e-10
         assert high >= first[name].max() > high - 0.1 * (high - low)
-        assert torch.equal(third[name][others], first[name][others])
+        assert torch.equal(third[name][untouched], first[name][untouched])
         assert (third[name][[3, 7]] != first[name][[3, 7]]).all()
 
 
 def test_a_range_of_the_release_threshold(tmp_path):
-    """Bits that are on go off below the environment's own threshold, somewhere in the range."""
+    """Active bits switch off below their environment's own threshold, somewhere in the range."""
     noise = {"release_threshold": [1e-3, 3e-3]}
-    made = document(tmp_path, "contact", noise, threshold=3.5e-3, gate="geometric")
-    touch = tgdsl.compile(made, dtype=torch.float64)
+    spec = document(tmp_path, "contact", noise, threshold=3.5e-3, gate="geometric")
+    touch = tgdsl.compile(spec, dtype=torch.float64)
     state = touch.example_state(200)
     state.body_pos, state.body_quat = torch.zeros(200, 4, 3, dtype=torch.float64), torch.zeros(200, 4, 4, dtype=torch.float64)
     state.body_quat[..., 0] = 1
     released = torch.zeros(200, dtype=torch.float64)
     item, depths = touch.inputs.bodies.index("item"), np.linspace(3.75e-3, 0.5e-3, 66)
-    for depth in depths:  # of the taxel in the middle: 10 mm up, of radius 4 mm, under a ball of 30 mm
+    for depth in depths:  # of the middle taxel: 10 mm up, of radius 4 mm, under a ball of 30 mm
         state.body_pos[:, item, 2] = 0.01 + 0.004 + 0.03 - depth
         is_off = touch(state)["s"][:, 0, 0] == 0
         released = torch.where(is_off & (released == 0), torch.tensor(depth, dtype=torch.float64), released)
@@ -84,12 +84,12 @@ def test_a_range_of_the_release_threshold(tmp_path):
     assert len(released.unique()) > 20
 
 
-def test_a_release_threshold_above_the_threshold(tmp_path):
-    (what,) = mistakes(tmp_path, "contact", {"release_threshold": [1e-4, 6e-4]}, threshold=5e-4)
-    assert what == "sensors.s.noise: release_threshold 0.0006 m is above the sensor's threshold 0.0005 m"
+def test_a_release_threshold_above_the_threshold_is_a_mistake(tmp_path):
+    (message,) = mistakes(tmp_path, "contact", {"release_threshold": [1e-4, 6e-4]}, threshold=5e-4)
+    assert message == "sensors.s.noise: release_threshold 0.0006 m is above the sensor's threshold 0.0005 m"
 
 
-def test_dead_readings_of_ranged_ends_lie_between_an_environments_own(tmp_path):
+def test_dead_readings_lie_between_the_ends_of_their_environment(tmp_path):
     """z_j ~ U[low, high] with low and high drawn per environment: taxels of one environment differ, also for equal ranges."""
     noise = {"dead_probability": 1, "dead_range": [[-1, 1], [-1, 1]]}
     touch = tgdsl.compile(document(tmp_path, "contact_depth", noise), dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Clean and measured readings, what each knob remembers, and what `explain` tells of it."""
+"""Clean and measured readings, the memory of each knob, and what `explain` reports."""
 
 from pathlib import Path
 
@@ -12,34 +12,34 @@ from tgdsl.sensors import KINDS
 from tgdsl.sensors.noise import PROFILES
 
 
-def example_of(folder: Path, kind: str, **changes) -> dict:
-    """A sensor of a kind as in the example, on two small links."""
-    (own,) = (sensor for sensor in YAML(typ="safe").load(EXAMPLE)["sensors"].values() if sensor["kind"] == kind)
+def example_document(folder: Path, kind: str, **changes) -> dict:
+    """Return a document with the example's sensor of a kind, on two small links."""
+    (example,) = (sensor for sensor in YAML(typ="safe").load(EXAMPLE)["sensors"].values() if sensor["kind"] == kind)
     coarse = {"proximity": {"tolerance": 0.1}}.get(kind, {})
-    made = document(folder, {"s": {**own, "links": ["pad", "tip"], "feels": ["item"], **coarse, **changes}})
-    made["objects"]["item"] |= {"material": "aluminium", "temperature": 45.0}
-    return made
+    spec = document(folder, {"s": {**example, "links": ["pad", "tip"], "feels": ["item"], **coarse, **changes}})
+    spec["objects"]["item"] |= {"material": "aluminium", "temperature": 45.0}
+    return spec
 
 
 @pytest.mark.parametrize("kind", [kind.name for kind in KINDS if kind.knobs])
 @pytest.mark.filterwarnings("ignore:sensor .* the profile .noisy. has no knobs:UserWarning")
 def test_both_readouts(tmp_path, kind):
-    """`s` is what a measured sensor reads, and `s/clean` is to the bit what one without noise reads."""
-    both = tgdsl.compile(example_of(tmp_path, kind, noise="noisy", readout="both"))
-    measured = tgdsl.compile(example_of(tmp_path, kind, noise="noisy"))
-    clean = tgdsl.compile(example_of(tmp_path, kind))
+    """`s` equals the reading of a measured sensor; `s/clean` equals, to the bit, that without noise."""
+    both = tgdsl.compile(example_document(tmp_path, kind, noise="noisy", readout="both"))
+    measured = tgdsl.compile(example_document(tmp_path, kind, noise="noisy"))
+    clean = tgdsl.compile(example_document(tmp_path, kind))
     shapes = {output.name: output.shape for output in both.outputs}
     assert shapes["s"] == shapes["s/clean"] == clean.outputs[0].shape
     is_noisy = kind in PROFILES["noisy"]
     differs = False
     for seed in range(4):
         state = both.example_state(4, seed=seed)
-        found, alone, expected = both(state), measured(state), clean(state)
-        assert set(found) == {*expected, "s/clean"}
-        assert torch.equal(found["s/clean"], expected["s"])
-        assert torch.equal(found["s"], alone["s"])
-        assert all(torch.equal(found[name], expected[name]) for name in expected if name != "s")
-        differs |= not torch.equal(found["s"], found["s/clean"])
+        readings, alone, expected = both(state), measured(state), clean(state)
+        assert set(readings) == {*expected, "s/clean"}
+        assert torch.equal(readings["s/clean"], expected["s"])
+        assert torch.equal(readings["s"], alone["s"])
+        assert all(torch.equal(readings[name], expected[name]) for name in expected if name != "s")
+        differs |= not torch.equal(readings["s"], readings["s/clean"])
     assert differs == is_noisy
 
 
@@ -78,7 +78,7 @@ OWN_BUFFERS = {
     "quantization": ([], False, False),
     "dead_probability": ([], True, False),
 }
-"""Of each knob what is remembered of each channel, whether the clock is needed, and whether dt is."""
+"""Per knob: what it remembers of each channel, whether it needs the clock, and whether it needs dt."""
 
 
 FILTERS = ("hysteresis", "read_delay", "jitter")
@@ -86,26 +86,28 @@ FILTERS = ("hysteresis", "read_delay", "jitter")
 
 
 @pytest.mark.parametrize("knob", OWN_BUFFERS)
-def test_each_knob_remembers_its_own(build, knob):
-    names, is_timed, wants_dt = OWN_BUFFERS[knob]
+def test_each_knob_remembers_its_own_state(build, knob):
+    names, is_timed, needs_dt = OWN_BUFFERS[knob]
     touch, plain = build(s={"noise": {knob: EVERY_KNOB[knob]}}), build(s={})
-    disturbed, clean = (read(module, range(2), num_envs=64) for module in (touch, plain))  # so many that a dead taxel is felt
+    disturbed, clean = (
+        read(module, range(2), num_envs=64) for module in (touch, plain)
+    )  # enough for a dead taxel with contact
     is_disturbed = [not torch.equal(a["s"], b["s"]) for a, b in zip(disturbed, clean, strict=True)]
     assert is_disturbed == [knob not in FILTERS, True]
     expected = {f"memory.s:noise/{name}" for name in names}
     ages = {"memory.clock.ages"} if "ring" in names else set()
     assert set(touch.state_dict()) == expected | ages | (CLOCK if is_timed else set())
-    assert set(touch.inputs.fields) - set(plain.inputs.fields) == ({"dt"} if wants_dt else set())
+    assert set(touch.inputs.fields) - set(plain.inputs.fields) == ({"dt"} if needs_dt else set())
 
 
-def test_a_range_needs_the_clock_alone(build):
+def test_a_range_needs_only_the_clock(build):
     touch = build(s={"noise": {"bias": [0, 1], "quantization": [1e-3, 2e-3], "crosstalk": RANGES["crosstalk"]}})
     touch(touch.example_state(2))
     assert set(touch.state_dict()) == CLOCK
 
 
-def test_the_knobs_of_a_contact_act_before_its_threshold(build):
-    """A bias above the threshold switches every taxel on; nothing but bits is read."""
+def test_knobs_of_a_contact_sensor_act_before_its_threshold(build):
+    """A bias above the threshold switches every taxel on; readings are bits."""
     noise = {"bias": 1e-3, "white_noise": 1e-5}
     touch = build(
         c={"kind": "contact", "threshold": 5e-4, "noise": noise}, d={"kind": "contact", "noise": {"white_noise": 2e-4}}
@@ -115,7 +117,7 @@ def test_the_knobs_of_a_contact_act_before_its_threshold(build):
     assert set(readings["d"].unique().tolist()) == {0.0, 1.0}
 
 
-def test_explain_tells_the_stages_and_their_values(build):
+def test_explain_lists_the_stages_and_their_values(build):
     noise = {
         **{name: EVERY_KNOB[name] for name in ("radius_noise", "gain", "hysteresis", "bias", "white_noise")},
         "drift": {"force": [1e-4, 2e-4]},
@@ -139,14 +141,14 @@ def test_explain_tells_the_stages_and_their_values(build):
     assert "rate: 60 Hz" in text and "history: stack of 4 calls" in text
     num = 17 * 6 * 4
     fixed = 4 * num + 4 + 4 * num  # lag, last, walk and held sample; phase; the history
-    what = "noise lag, noise last, noise ring, noise walk, sample phase, sample measured, history"
+    memory = "noise lag, noise last, noise ring, noise walk, sample phase, sample measured, history"
     per_taxel = f"{fixed / 17:.3g} per taxel, and for each call of the last 0.03 s {num} bytes, 24 per taxel"
-    assert f"remembers {what} ({fixed} bytes per environment), {per_taxel}" in text
+    assert f"remembers {memory} ({fixed} bytes per environment), {per_taxel}" in text
     assert f"remembers    {fixed + 24:>10} bytes, and {num} for each call of the delays" in text
 
 
-def test_explain_says_which_taxels_have_noise(build):
-    """Of links by name: numbers are those of the taxels that have it, and shares are percentages."""
+def test_explain_names_the_taxels_with_noise(build):
+    """With noise on named links: numbers are those of the noisy taxels, shares are percentages."""
     noise = {"links": {"tip": {"gain": [0.9, 1.1], "white_noise": {"force": 0.25}, "dead_probability": 0.0005}}}
     touch = build(torch.float32, s={"noise": noise})
     num = int((touch.plan.layout.link_id == [link.name for link in touch.plan.layout.links].index("tip")).sum())
@@ -162,8 +164,8 @@ def test_explain_says_which_taxels_have_noise(build):
 
 @pytest.mark.parametrize("history", [{}, {"history": 3}, {"history": {"length": 5, "reduce": "mean"}}, {"history": {"length": 5, "reduce": "last"}}])  # fmt: skip
 @pytest.mark.parametrize("knobs", [[], ["drift"], ["read_delay", "jitter"], ["gain"], list(EVERY_KNOB)])
-def test_explain_counts_the_bytes_that_are_there(build, history, knobs):
-    """What it says is what buffers hold after a call."""
+def test_explain_counts_the_bytes_of_the_buffers(build, history, knobs):
+    """The stated bytes are what the buffers hold after a call."""
     noise = {knob: EVERY_KNOB[knob] for knob in knobs}
     touch = build(
         torch.float32, s={"noise": noise, "readout": "both", **history}, c={"kind": "contact", "release_threshold": 1e-4}
@@ -172,13 +174,13 @@ def test_explain_counts_the_bytes_that_are_there(build, history, knobs):
     state.dt = 0.01 if "dt" in touch.inputs.fields else None
     (line,) = (line for line in touch.explain().splitlines() if "remembers  " in line)
     words = line.replace(",", "").split()
-    said = int(words[1]) + (3 * int(words[4]) if "delays" in line else 0)  # 13 + 11 ms are within three calls
+    stated = int(words[1]) + (3 * int(words[4]) if "delays" in line else 0)  # 13 + 11 ms are within three calls
     touch(state)
-    held = [
+    buffers = [
         buffer
         for name, buffer in touch.state_dict().items()
         if isinstance(buffer, torch.Tensor)
         and buffer.ndim > 0
         and not name.endswith("clock.ages")  # the same for all environments
     ]
-    assert said == sum(buffer[0].numel() * buffer.element_size() for buffer in held)
+    assert stated == sum(buffer[0].numel() * buffer.element_size() for buffer in buffers)

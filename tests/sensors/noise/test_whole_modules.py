@@ -1,4 +1,4 @@
-"""What a module with noise reads is what the definition makes of its clean reading."""
+"""The noisy reading of a module equals the definition applied to its clean reading."""
 
 import dataclasses
 from pathlib import Path
@@ -24,7 +24,7 @@ PADS = """
 
 
 def pads(folder: Path, kind: str, noise: dict[str, Any], **sensor: Any) -> TactileModule:
-    """A module with one sensor, `s`, on two bodies of 4 and 3 probes that reach 50 mm."""
+    """Return a module with one sensor, `s`, on two bodies of 4 and 3 probes that reach 50 mm."""
     model = folder / "pads.xml"
     model.write_text(PADS)
     points = [{"pos": [x * MM, 0, 20 * MM], "normal": [0, 0, 1], "radius": "50 mm"} for x in range(4)]
@@ -41,12 +41,12 @@ def pads(folder: Path, kind: str, noise: dict[str, Any], **sensor: Any) -> Tacti
 
 
 def definitions_of(touch: TactileModule, seed: int, rows: list[dict[str, Any]], num_envs: int, first: int = 0) -> list[Any]:
-    sets, layout = [Knobs.model_validate(own) for own in rows], touch.plan.layout_of(touch.plan.sensors[0])
+    sets, layout = [Knobs.model_validate(row) for row in rows], touch.plan.layout_of(touch.plan.sensors[0])
     key, channels = random.sensor_key(seed, "s"), touch.outputs[0].channels
     return [ReferenceNoise(sets, channels, key, first + env, layout) for env in range(num_envs)]
 
 
-def test_a_module_reads_what_is_defined(tmp_path):
+def test_a_module_matches_the_definition(tmp_path):
     on_b = {"hysteresis": {"strength": 0.2, "time_constant": 0.5}, "read_delay": [0, 3e-3], "drift": 1e-3, "gain": [2, 3]}
     common = {**ALL_TOGETHER, "white_noise": 1e-3}
     touch = pads(tmp_path, "kinematic_taxel", {**common, "links": {"b": on_b}}, gate="geometric").seed(5, first_env=100)
@@ -57,15 +57,15 @@ def test_a_module_reads_what_is_defined(tmp_path):
             touch.reset([env])
             definitions[env].reset()
         readings = touch(dataclasses.replace(touch.example_state(3, seed=call), dt=DT))
-        clean, found = readings["s/clean"].numpy(), readings["s"].numpy()
+        clean, measured = readings["s/clean"].numpy(), readings["s"].numpy()
         expected = [d.read(d.gain * clean[env], DT) for env, d in enumerate(definitions)]
         scale = max(scale, np.abs(clean).max())
-        np.testing.assert_allclose(found, expected, rtol=0, atol=NORMAL)
+        np.testing.assert_allclose(measured, expected, rtol=0, atol=NORMAL)
     assert scale > 1
 
 
-def test_a_module_disturbs_radii_before_it_feels_and_holds_between_samples(tmp_path):
-    """Depth is γ (R̃ − φ), where the clean one is R − φ; taxels are far inside. The sensor takes every fourth call."""
+def test_a_module_disturbs_radii_first_and_holds_between_samples(tmp_path):
+    """Depth is γ (R̃ − φ), clean depth R − φ; taxels are far inside. The sensor samples every fourth call."""
     noise = {"radius_noise": [1 * MM, 3 * MM], "gain": [0.5, 1.5], "bias": 0.1, "drift": 1e-3}
     touch = pads(tmp_path, "contact_depth", noise, gate="geometric", rate=1 / (4 * DT))
     definitions = definitions_of(touch, 0, [noise] * 7, 3)
@@ -86,8 +86,8 @@ def test_a_module_disturbs_radii_before_it_feels_and_holds_between_samples(tmp_p
 
 
 @pytest.mark.parametrize("name", ["foo_x", "y", "ball_y_z"])
-def test_a_distance_is_named_by_its_object_whatever_that_ends_in(tmp_path, name):
-    """An amplitude for `distance_foo_x` is no component's of `distance_foo`: module and definition read the same."""
+def test_a_distance_is_named_by_its_object_whatever_the_names_end(tmp_path, name):
+    """An amplitude for `distance_foo_x` is not that of a component of `distance_foo`: module and definition agree."""
     model = tmp_path / "pads.xml"
     model.write_text(PADS)
     points = [{"pos": [0, 0, 20 * MM], "normal": [0, 0, 1], "radius": "50 mm"}]

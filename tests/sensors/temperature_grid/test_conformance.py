@@ -1,4 +1,4 @@
-"""The suite of all kinds, of temperatures: objects of one temperature, with cells, links that touch one another."""
+"""The conformance suite for temperatures: uniform objects, objects with cells, and links that touch."""
 
 import pytest
 import torch
@@ -17,7 +17,7 @@ class TestTemperatureGrid(KindConformance):
     kind = TEMPERATURE_GRID
     gates = ()
     rest = 22.0
-    is_differentiable = False  # the first reading after a reset is the start; see below
+    is_differentiable = False  # the first reading after a reset is the initial temperature; see below
     parameters = {"cells": [3, 2, 2], "material": "copper", "emissivity": 0.5, "convection": 20.0}
     objects = HEAT
     test_taxel_permutation_commutes = None  # it reads no taxels
@@ -27,7 +27,7 @@ class TestTemperatureGrid(KindConformance):
         return {**super().document(scene, **changes), "objects": self.objects}
 
     def test_a_broken_pose_is_seen(self, scene):
-        """From the second reading on, contacts and with them the links' poses count."""
+        """From the second reading on contacts count, and with them the links' poses."""
         module, _ = self.build(self.document(scene), torch.float32)
         first, second, *_ = self.states(module, 2)
         module(first)
@@ -102,7 +102,7 @@ class TestPaperByTheManifold(TestTemperatureGrid):
 
 
 class TestPerEnvironment(TestTemperatureGrid):
-    """Temperatures and materials that the state gives, and an object with cells: one graph of all options."""
+    """Temperatures and materials from the state, and an object with cells: one graph of all options."""
 
     test_compiled_equals_eager = KindConformance.test_compiled_equals_eager
     objects = HEAT | {
@@ -115,7 +115,7 @@ class TestPerEnvironment(TestTemperatureGrid):
         "source": {"power": 2.0}, "lag": 0.3,
     }  # fmt: skip
 
-    def test_the_state_is_what_counts(self, scene):
+    def test_temperatures_come_from_the_state(self, scene):
         module, _ = self.build(self.document(scene), torch.float64)
         assert {"object_temperature", "object_material"} <= set(module.inputs.fields)
         state = module.example_state(3, seed=0)

@@ -1,7 +1,7 @@
-"""The clamped boundary against closed forms: slabs, discs (Bessel), exact plane-wave solutions, and its own refinement.
+"""The clamped boundary against closed forms: slabs, discs (Bessel), exact plane waves, and its own refinement.
 
-Errors are over the largest displacement prescribed on the edge. At the element size of the rule the finite elements err by
-less than `RULE`; where the outline is curved, its polygon adds to that.
+Errors are relative to the largest displacement prescribed on the edge. At the rule's element size the finite elements err by
+less than `RULE`; the polygon of a curved outline adds to that.
 """
 
 import numpy as np
@@ -23,19 +23,19 @@ RANDOM = np.random.default_rng(3)
 
 
 def plate_pad(surface: Surface, places: np.ndarray, size: float = SIZE) -> Pad:
-    """A pad in the plane z = 0, whose plane axes are x and y."""
+    """Return a pad in the plane z = 0, with plane axes x and y."""
     pad = unroll(surface, *pads.upward(places), size)
     np.testing.assert_allclose(pad.edge_axes, np.tile(np.eye(3)[:2], (len(pad.edge), 1, 1)), atol=1e-9)
     return pad
 
 
-def solved(pad: Pad, field, bulk: float, drag: float = DRAG) -> np.ndarray:
-    """Displacement (taxel, 2) of a flat pad whose edge is displaced by `field` of (x, y)."""
+def displacements(pad: Pad, field, bulk: float, drag: float = DRAG) -> np.ndarray:
+    """Return the displacement (taxel, 2) of a flat pad whose edge `field` of (x, y) displaces."""
     return (correction(pad, THICKNESS, drag, bulk) @ field(pad.edge_pos[:, :2]).T.ravel()).reshape(2, -1).T
 
 
 def waves(bulk: float, turn: float = 0.4):
-    """Exact solutions: d exp(κ d·x) along itself, κ² = β/(t² (1 + K)), and across itself with κ² = β/t²; a sum of three."""
+    """Return a sum of three exact solutions: d exp(κ d·x) along itself, κ² = β/(t² (1 + K)), and across itself, κ² = β/t²."""
     along, across = RATE / np.sqrt(1 + bulk), RATE
     parts = [(along, turn, 0.0, 1.0), (across, turn + 2.1, np.pi / 2, 0.7), (along, turn + 4.0, 0.0, -0.5)]
 
@@ -51,7 +51,7 @@ def waves(bulk: float, turn: float = 0.4):
 
 
 def test_the_waves_solve_the_equation():
-    """By central differences, so that the oracle of this file is not taken on trust."""
+    """By central differences, to verify the oracle of this file."""
     h, at = 0.02 * MM, RANDOM.uniform(-8, 8, (12, 2)) * MM
     for bulk in (0.0, 2.0):
         u = waves(bulk)
@@ -65,7 +65,7 @@ def test_the_waves_solve_the_equation():
 
 
 @pytest.mark.parametrize(("shape", "bulk"), [("l_shape", 5.0), ("ring", 0.5), ("plate", 0.0)])
-def test_exact_solutions(shape, bulk):
+def test_displacements_match_exact_solutions(shape, bulk):
     surface = {
         "l_shape": pads.l_shape(),
         "ring": pads.ring(),
@@ -77,12 +77,12 @@ def test_exact_solutions(shape, bulk):
     places = places[inside[shape]]
     pad = plate_pad(surface[shape], places)
     field = waves(bulk)
-    error = np.abs(solved(pad, field, bulk) - field(places)).max()
+    error = np.abs(displacements(pad, field, bulk) - field(places)).max()
     assert error < RULE * np.abs(field(pad.edge_pos[:, :2])).max()
 
 
 def test_order_of_convergence(monkeypatch):
-    """Quadratic elements of one size on a polygon: third order."""
+    """Quadratic elements of one size on a polygon converge with third order."""
     monkeypatch.setattr("tgdsl.sensors.elastomer.clamped.pad.GRADE", 1e-3)
     places = RANDOM.uniform(-9, 9, (100, 2)) * MM
     reach = np.hypot(*places.T)
@@ -91,14 +91,14 @@ def test_order_of_convergence(monkeypatch):
     sizes = np.array([1.2, 0.6, 0.3]) * MM
     errors = []
     for size in sizes:
-        error = solved(plate_pad(pads.ring(), places, float(size)), field, 2.0) - field(places)
+        error = displacements(plate_pad(pads.ring(), places, float(size)), field, 2.0) - field(places)
         errors.append(np.sqrt((error**2).mean()))
     assert np.polyfit(np.log(sizes), np.log(errors), 1)[0] > 2.7
 
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_long_strip(axis):
-    """One long side moves, the other is held: sinh κ(W − y) / sinh κW; κ is the smaller by √(1 + K) for motion across it."""
+    """One long side moves, the other is held: sinh κ(W − y) / sinh κW; κ is smaller by √(1 + K) for motion across it."""
     width, bulk = 8 * MM, 3.0
     y = np.linspace(0.3, 7.5, 25) * MM
     pad = plate_pad(pads.plate(60 * MM, width), np.stack([np.full(25, 30 * MM), y], axis=1), 0.29 * MM)
@@ -111,8 +111,8 @@ def test_a_long_strip(axis):
     rate = RATE / np.sqrt(1 + bulk) if axis == 1 else RATE
     expected = np.zeros((25, 2))
     expected[:, axis] = np.sinh(rate * (width - y)) / np.sinh(rate * width)
-    np.testing.assert_allclose(solved(pad, side, bulk), expected, atol=RULE)
-    if axis == 0:  # the half-plane's, far from the other side
+    np.testing.assert_allclose(displacements(pad, side, bulk), expected, atol=RULE)
+    if axis == 0:  # as on a half-plane, far from the other side
         np.testing.assert_allclose(expected[:10, 0], np.exp(-rate * y[:10]), atol=3e-3)
 
 
@@ -131,27 +131,29 @@ def test_a_disc(data, bulk):
     rate = RATE / np.sqrt(1 + bulk) if data == "radial" else RATE
     order = 0 if data == "constant" else 1
     expected = (iv(order, rate * reach) / iv(order, rate * radius))[:, None] * directions[data](places)
-    np.testing.assert_allclose(solved(pad, directions[data], bulk), expected, atol=RULE)
+    np.testing.assert_allclose(displacements(pad, directions[data], bulk), expected, atol=RULE)
 
 
 def test_without_drag_a_linear_displacement_is_exact():
-    """The patch test: shift, turn and stretch of the edge reach every taxel unchanged, to rounding."""
+    """The patch test: shift, rotation and stretch of the edge reach every taxel unchanged, up to rounding."""
     places = RANDOM.uniform(-9, -1, (30, 2)) * MM
     pad = plate_pad(pads.l_shape(), places)
     matrix, shift = RANDOM.normal(size=(2, 2)) / (10 * MM), RANDOM.normal(size=2)
-    np.testing.assert_allclose(solved(pad, lambda at: at @ matrix.T + shift, 7.0, 0.0), places @ matrix.T + shift, atol=1e-9)
+    np.testing.assert_allclose(
+        displacements(pad, lambda at: at @ matrix.T + shift, 7.0, 0.0), places @ matrix.T + shift, atol=1e-9
+    )
 
 
 def test_one_triangle_without_inner_nodes():
-    """All six nodes are on the edge: a quadratic displacement is interpolated as it is."""
+    """All six nodes are on the edge: a quadratic displacement is interpolated exactly."""
     surface = pads.soup(np.array([[[0, 0, 0], [6, 0, 0], [1, 5, 0]]]) * MM)
     places = np.array([[2.0, 1.0], [1.5, 2.5]]) * MM
     pad = plate_pad(surface, places, 50 * MM)
     assert pad.basis.N == len(pad.edge) == 6
-    np.testing.assert_allclose(solved(pad, lambda at: (at / MM) ** 2, 1.0), (places / MM) ** 2, rtol=1e-9)
+    np.testing.assert_allclose(displacements(pad, lambda at: (at / MM) ** 2, 1.0), (places / MM) ** 2, rtol=1e-9)
 
 
-def test_only_drag_over_thickness_squared_counts():
+def test_only_drag_over_thickness_squared_matters():
     pad = plate_pad(pads.plate(), np.array([[3.0, 4.0], [11.0, 2.0]]) * MM, 1 * MM)
     np.testing.assert_allclose(correction(pad, 2 * MM, 3.0, 1.0), correction(pad, 4 * MM, 12.0, 1.0), atol=1e-12)
 
@@ -159,25 +161,27 @@ def test_only_drag_over_thickness_squared_counts():
 def test_a_taxel_at_the_edge_moves_with_it():
     places = np.array([[0.0, 7.3], [25.0, 20.0], [12.1, 0.0]]) * MM
     pad = plate_pad(pads.plate(), places)
-    np.testing.assert_allclose(solved(pad, lambda at: at / MM, 1.0), places / MM, atol=1e-8)
+    np.testing.assert_allclose(displacements(pad, lambda at: at / MM, 1.0), places / MM, atol=1e-8)
 
 
-def test_the_triangles_of_the_surface_do_not_matter():
-    """Many alike, or slivers."""
+def test_the_triangulation_does_not_matter():
+    """Many equal triangles, or slivers."""
     places = RANDOM.uniform([1, 1], [24, 19], (40, 2)) * MM
-    want = solved(plate_pad(pads.plate(), places), waves(2.0), 2.0)
+    expected = displacements(plate_pad(pads.plate(), places), waves(2.0), 2.0)
     for surface in (pads.plate(cells=(40, 32)), pads.slivers()):
-        np.testing.assert_allclose(solved(plate_pad(surface, places), waves(2.0), 2.0), want, atol=RULE * np.abs(want).max())
+        np.testing.assert_allclose(
+            displacements(plate_pad(surface, places), waves(2.0), 2.0), expected, atol=RULE * np.abs(expected).max()
+        )
 
 
-def test_a_half_cylinder_is_the_rectangle_of_its_arc():
+def test_a_half_cylinder_equals_the_rectangle_of_its_arc():
     """A field of arc and height on its edge reaches the taxels as on the flat rectangle; facets shift the edge by their angle."""
     radius, length = 8 * MM, 20 * MM
     arc, along = RANDOM.uniform(-11.5, 11.5, 50) * MM, RANDOM.uniform(1, 19, 50) * MM
     field = lambda at: waves(2.0, 1.1)(at - [0, 10 * MM])  # noqa: E731
     flat_surface = pads.moved(pads.plate(np.pi * radius, length), np.eye(3), np.array([-np.pi / 2 * radius, 0, 0]))
     flat = plate_pad(flat_surface, np.stack([arc, along], axis=1))
-    want = solved(flat, field, 2.0)
+    expected = displacements(flat, field, 2.0)
     normal = np.stack([np.cos(arc / radius), np.sin(arc / radius), 0 * arc], axis=1)
     pad = unroll(pads.cylinder(radius, np.pi, length, (64, 1)), radius * normal + along[:, None] * pads.UP, normal, SIZE)
     angle = np.arctan2(pad.edge_pos[:, 1], pad.edge_pos[:, 0])
@@ -189,12 +193,12 @@ def test_a_half_cylinder_is_the_rectangle_of_its_arc():
     moved = (correction(pad, THICKNESS, DRAG, 2.0) @ prescribed.ravel()).reshape(2, -1)
     in_space = np.einsum("tux,ut->tx", pad.taxel_axes, moved)
     around = np.stack([-normal[:, 1], normal[:, 0], 0 * arc], axis=1)
-    got = np.stack([(in_space * around).sum(axis=1), in_space[:, 2]], axis=1)
-    np.testing.assert_allclose(got, want, atol=RULE * np.abs(field(flat.edge_pos[:, :2])).max())
+    result = np.stack([(in_space * around).sum(axis=1), in_space[:, 2]], axis=1)
+    np.testing.assert_allclose(result, expected, atol=RULE * np.abs(field(flat.edge_pos[:, :2])).max())
 
 
 def test_the_rule_of_the_element_size():
-    """A quarter of the layer on pads larger than it, the pad's 24th on smaller ones and without drag."""
+    """A quarter of the layer on pads larger than it; a 24th of the pad on smaller ones and without drag."""
     np.testing.assert_allclose(element_size(2 * MM, 3.0, 25 * MM), 2 * MM / np.sqrt(3) / 4)
     np.testing.assert_allclose(element_size(20 * MM, 3.0, 24 * MM), 1 * MM)
     np.testing.assert_allclose(element_size(2 * MM, 0.0, 24 * MM), 1 * MM)
@@ -205,8 +209,8 @@ def test_the_rule_of_the_element_size():
     assert caught.value.field == "boundary"
 
 
-def test_the_rule_foresees_the_corners():
-    """Its count of corners for a square is not below, and not far above, that of the mesh."""
+def test_the_rule_estimates_the_corners():
+    """For a square it counts at least the corners of the mesh, and not many more."""
     side = 40 * MM
     size = element_size(1.5 * MM, DRAG, side)
     pad = plate_pad(pads.plate(side, side), np.array([[1.0, 1.0]]) * MM, size)

@@ -1,9 +1,9 @@
-"""A clamped pad from the document to the reading, against two solutions of the membrane's equation by other ways.
+"""A clamped pad from document to reading, against two other solutions of the membrane's equation.
 
-The one takes the pad's own mesh: energies of its elements by quadrature, one dense matrix, the rows of the edge removed, and
-solved again for each displacement of the edge; so readings agree to rounding. The other knows no mesh: on a rectangle it sets
-the equation itself at Chebyshev points (Trefethen, *Spectral Methods in MATLAB*, 2000, chapter 7), and readings agree within
-the error that `boundary.element_size` allows, 1e-3 of the largest displacement of the edge.
+The first uses the pad's own mesh: element energies by quadrature, one dense matrix without the rows of the edge, solved
+again for each displacement of the edge; readings agree to rounding. The second has no mesh: on a rectangle it sets the
+equation at Chebyshev points (Trefethen, *Spectral Methods in MATLAB*, 2000, chapter 7); readings agree within the error
+that `boundary.element_size` allows, 1e-3 of the largest displacement of the edge.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ from tgdsl.sensors.elastomer.reference import reference
 from tgdsl.testing import SCENE, KindConformance, ReferenceModule, conformance_document
 
 PALM, TIP = (0.03, 0.008, 0.01), (0.006, 0.02, 0.012)
-"""Half sizes of two boxes [m], whose upper sides are the pads."""
+"""Half sizes of two boxes [m]; their upper sides are the pads."""
 PADS = SCENE.replace('type="box" size=".03 .02 .01"', 'type="box" size=".03 .008 .01"').replace(
     'type="sphere" size=".012"', 'type="box" size=".006 .02 .012"'
 )
@@ -53,30 +53,30 @@ def membrane(pad, rate, bulk):
 
 
 class DenseReference:
-    """The kind's reference, and what the clamped edge adds to it; matrices of a pad are kept from call to call."""
+    """The kind's reference plus the effect of the clamped edge; matrices of a pad persist between calls."""
 
     def __init__(self, surface_of):
         self.surface_of, self.pads = surface_of, {}
 
     def __call__(self, spec, layout, gathered, context, state):
-        found, after = reference(spec.model_copy(update={"boundary": None}), layout, gathered, context, state)
+        readings, after = reference(spec.model_copy(update={"boundary": None}), layout, gathered, context, state)
         for link in range(len(layout.links)):
-            own = np.flatnonzero((layout.link_id == link) & (layout.radius > 0))
-            found[own] += self.moved_back(spec, layout, link, own, gathered[ContactDepth].depth[own])
-        return found, after
+            taxels = np.flatnonzero((layout.link_id == link) & (layout.radius > 0))
+            readings[taxels] += self.moved_back(spec, layout, link, taxels, gathered[ContactDepth].depth[taxels])
+        return readings, after
 
-    def moved_back(self, spec, layout, link, own, depth):
+    def moved_back(self, spec, layout, link, taxels, depth):
         edge, drag = spec.boundary, spec.boundary.drag
         if link not in self.pads:
             surface = self.surface_of(layout.links[link].name, edge.pad)
             extent = np.ptp(surface.vertices[surface.faces].reshape(-1, 3), axis=0).max()
-            pad = unroll(surface, layout.pos[own], layout.normal[own], element_size(spec.thickness, drag, float(extent)))
+            pad = unroll(surface, layout.pos[taxels], layout.normal[taxels], element_size(spec.thickness, drag, float(extent)))
             matrix = membrane(pad, np.sqrt(drag) / spec.thickness, edge.bulk)
             edge_rows = np.concatenate([pad.edge, pad.edge + pad.basis.N])
             inner = np.setdiff1d(np.arange(2 * pad.basis.N), edge_rows)
             self.pads[link] = pad, inner, lu_factor(matrix[np.ix_(inner, inner)]), matrix[np.ix_(inner, edge_rows)]
         pad, inner, factors, to_edge = self.pads[link]
-        free = spread(spec, pad.edge_pos, pad.edge_normal, layout.pos[own], layout.area[own] / spec.reference_area, depth)
+        free = spread(spec, pad.edge_pos, pad.edge_normal, layout.pos[taxels], layout.area[taxels] / spec.reference_area, depth)
         moved = np.zeros((2, pad.basis.N))
         moved[:, pad.edge] = -np.einsum("eak,ek->ae", pad.edge_axes, free)
         moved.ravel()[inner] = -lu_solve(factors, to_edge @ moved[:, pad.edge].ravel())
@@ -84,16 +84,16 @@ class DenseReference:
 
 
 def spread(spec, places, normals, sources, weights, depth):
-    """Return s_d Σ_i a_i h_i r_i (c g + (1 − c) ḡ/ρ̄ ρ) [m] at places of the free skin, one after the other."""
-    found, peak = np.zeros((len(places), 3)), np.exp(-0.5) / np.sqrt(2 * spec.dilation_falloff)
+    """Return s_d Σ_i a_i h_i r_i (c g + (1 − c) ḡ/ρ̄ ρ) [m] of the free skin, one place at a time."""
+    shifts, peak = np.zeros((len(places), 3)), np.exp(-0.5) / np.sqrt(2 * spec.dilation_falloff)
     for j, (x, n) in enumerate(zip(places, normals, strict=True)):
         r = x - sources
         r = r - np.outer(r @ n, n)
         square = (r**2).sum(axis=1)
         far = peak * 2 * spec.thickness / (square + spec.thickness**2)
         size = spec.compressibility * np.exp(-spec.dilation_falloff * square) + (1 - spec.compressibility) * far
-        found[j] = spec.dilation_strength * (weights * depth * size) @ r
-    return found
+        shifts[j] = spec.dilation_strength * (weights * depth * size) @ r
+    return shifts
 
 
 class Clamped(KindConformance):
@@ -104,7 +104,7 @@ class Clamped(KindConformance):
     }  # fmt: skip
     gates = ("geometric",)
     test_taxel_permutation_commutes = None  # its taxels are on no pad
-    test_compiled_equals_eager = None  # its graph is that of a pad whose edge is free
+    test_compiled_equals_eager = None  # its graph equals that of a pad with a free edge
 
     @pytest.fixture
     def scene(self, tmp_path_factory):
@@ -140,18 +140,18 @@ class TestClampedWithoutBulk(Clamped):
         "boundary": {**Clamped.parameters["boundary"], "bulk": 0.0, "drag": 0.5},
         "friction": 0.5,
     }
-    test_gradients_equal_finite_differences = None  # those of the suite above
+    test_gradients_equal_finite_differences = None  # as in the suite above
     test_gradients_of_parameters_equal_finite_differences = None
 
 
-def test_the_edge_matters(tmp_path):
-    """In the suite's states clamping moves markers by much more than rounding."""
+def test_clamping_the_edge_matters(tmp_path):
+    """In the suite's states clamping moves markers far more than rounding does."""
     suite, scene = TestClamped(), tmp_path / "scene.xml"
     scene.write_text(PADS)
     clamped, _ = suite.build(suite.document(scene, shear_strength=0), torch.float64)
     free = tgdsl.compile(suite.document(scene, shear_strength=0, boundary=None), dtype=torch.float64)
-    for given in suite.states(clamped):
-        readings = clamped(given)["s"][..., :2], free(given)["s"][..., :2]
+    for inputs in suite.states(clamped):
+        readings = clamped(inputs)["s"][..., :2], free(inputs)["s"][..., :2]
         assert (readings[0] - readings[1]).abs().max() > 0.05 * readings[1].abs().max()
 
 
@@ -163,8 +163,8 @@ def chebyshev(num, length):
     return length / 2 * (x + 1), (slope - np.diag(slope.sum(axis=1))) * 2 / length
 
 
-def collocated(width, length, rate, bulk, given, places, nums):
-    """Return u (place, 2) of −∇²u + κ² u − K ∇(∇·u) = 0 on a rectangle whose edge is displaced by `given` of (x, y)."""
+def collocated(width, length, rate, bulk, displacement, places, nums):
+    """Return u (place, 2) of −∇²u + κ² u − K ∇(∇·u) = 0 on a rectangle whose edge `displacement` of (x, y) displaces."""
     (x, slope_x), (y, slope_y) = chebyshev(nums[0], width), chebyshev(nums[1], length)
     eye_x, eye_y = np.eye(len(x)), np.eye(len(y))
     xx, yy, xy = np.kron(slope_x @ slope_x, eye_y), np.kron(eye_x, slope_y @ slope_y), np.kron(slope_x, slope_y)
@@ -172,7 +172,7 @@ def collocated(width, length, rate, bulk, given, places, nums):
     matrix = np.block([[apart - bulk * xx, -bulk * xy], [-bulk * xy, apart - bulk * yy]])
     at = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
     on_edge = np.tile((at[:, 0] % width == 0) | (at[:, 1] % length == 0), 2)
-    u = np.where(on_edge, given(at).T.ravel(), 0.0)
+    u = np.where(on_edge, displacement(at).T.ravel(), 0.0)
     u[~on_edge] = np.linalg.solve(matrix[np.ix_(~on_edge, ~on_edge)], -matrix[np.ix_(~on_edge, on_edge)] @ u[on_edge])
     fit = [
         np.linalg.solve(np.polynomial.chebyshev.chebvander(2 * line / size - 1, num).T, basis.T).T
@@ -189,7 +189,7 @@ WIDTH, LENGTH, RADIUS = 0.02, 0.012, 0.015
 
 @pytest.mark.parametrize(("bulk", "compressibility"), [(0.0, 1.0), (2.0, 0.5)])
 def test_a_ball_on_a_rectangle(tmp_path, bulk, compressibility):
-    """Depths by hand, the printed sum for the free skin, Chebyshev points for what the edge takes back."""
+    """Depths by hand, the printed sum for the free skin, Chebyshev points for the effect of the edge."""
     (tmp_path / "scene.xml").write_text(
         f'<mujoco><worldbody><body name="pad"><freejoint/><geom type="box" size="{WIDTH / 2} {LENGTH / 2} .004"/></body>'
         f'<body name="item"><freejoint/><geom type="sphere" size="{RADIUS}"/></body></worldbody></mujoco>'
@@ -214,7 +214,7 @@ def test_a_ball_on_a_rectangle(tmp_path, bulk, compressibility):
     }
     touch = tgdsl.compile(document, dtype=torch.float64)
     centre = np.array([0.003, -0.002, 0.004 + RADIUS - 0.0012])
-    found = touch(state(touch, pos=centre.tolist()))["s"][0].numpy()
+    readings = touch(state(touch, pos=centre.tolist()))["s"][0].numpy()
 
     spec, up = ELASTOMER.spec(**{**sensor, "feels": ("item",)}), np.array([0.0, 0.0, 1.0])
     depth = np.maximum(0.0, RADIUS - np.linalg.norm(pos - centre, axis=1))
@@ -228,8 +228,8 @@ def test_a_ball_on_a_rectangle(tmp_path, bulk, compressibility):
     coarser = collocated(WIDTH, LENGTH, rate, bulk, free, places, (40, 30))
     rim = np.concatenate([[(x, y) for y in (0, LENGTH)] for x in np.linspace(0, WIDTH, 50)])
     rim = np.concatenate([rim, np.concatenate([[(x, y) for x in (0, WIDTH)] for y in np.linspace(0, LENGTH, 50)])])
-    most = np.abs(free(rim)).max()
-    assert np.abs(back - coarser).max() < 1e-4 * most and np.abs(back).max() > 0.2 * most
-    np.testing.assert_allclose(found[:, :2], free(places) - back, atol=1e-3 * most)
+    largest = np.abs(free(rim)).max()
+    assert np.abs(back - coarser).max() < 1e-4 * largest and np.abs(back).max() > 0.2 * largest
+    np.testing.assert_allclose(readings[:, :2], free(places) - back, atol=1e-3 * largest)
     bulge = 100 * np.exp(-8000 * ((places[:, None] - places) ** 2).sum(axis=2)) @ depth**1.2
-    np.testing.assert_allclose(found[:, 2], bulge, rtol=1e-12)
+    np.testing.assert_allclose(readings[:, 2], bulge, rtol=1e-12)

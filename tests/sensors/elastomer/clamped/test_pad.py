@@ -1,4 +1,4 @@
-"""Pads laid flat: isometric to the surface, whatever its triangles; what is no pad is refused by name.
+"""Pads laid flat: isometric to the surface, whatever its triangles; invalid pads are refused by name.
 
 Lengths agree to 1e-9 of the pad where the surface is exactly developable, else to the tolerance of the unrolling (2 %).
 """
@@ -34,7 +34,7 @@ PLATES = {
 
 
 def places(pad: Pad) -> np.ndarray:
-    """Where the taxels are in the plane."""
+    """Return the positions of the taxels in the plane."""
     return pad.at_taxels @ pad.basis.doflocs.T
 
 
@@ -43,7 +43,7 @@ def distances(points: np.ndarray) -> np.ndarray:
 
 
 def angles(pad: Pad) -> np.ndarray:
-    """Angles of the elements [deg]."""
+    """Return the angles of the elements [deg]."""
     corners = pad.basis.mesh.p.T[pad.basis.mesh.t.T]
     u, v = np.roll(corners, -1, axis=1) - corners, np.roll(corners, -2, axis=1) - corners
     return np.degrees(np.arctan2(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0], (u * v).sum(axis=2)))
@@ -55,13 +55,13 @@ def area(pad: Pad) -> float:
 
 
 def assert_frames(axes: np.ndarray, normal: np.ndarray) -> None:
-    """Orthonormal, right-handed with the normal."""
+    """Assert that axes are orthonormal and right-handed with the normal."""
     np.testing.assert_allclose(np.einsum("nux,nvx->nuv", axes, axes), np.tile(np.eye(2), (len(axes), 1, 1)), atol=1e-12)
     np.testing.assert_allclose(np.cross(axes[:, 0], axes[:, 1]), normal, atol=1e-12)
 
 
 @pytest.mark.parametrize("surface", PLATES.values(), ids=PLATES)
-def test_a_plate_is_itself_whatever_its_triangles(surface):
+def test_a_plate_stays_itself_whatever_its_triangles(surface):
     pos, normal = pads.upward(GRID)
     pad = unroll(surface, pos, normal, SIZE)
     rim = pad.edge_pos
@@ -116,8 +116,8 @@ def test_corners_and_holes_are_respected(surface, expected):
     assert on.all()
 
 
-def test_parts_that_touch_in_a_point_are_two():
-    """Two squares that meet in a corner only: the one that holds no taxel is left out."""
+def test_parts_that_touch_in_a_point_are_separate():
+    """Two squares that share only a corner: the one without taxels is dropped."""
     surface = Surface.joined(
         [pads.plate(10 * MM, 10 * MM), pads.moved(pads.plate(10 * MM, 10 * MM), np.eye(3), np.array([10, 10, 0]) * MM)]
     )
@@ -127,21 +127,21 @@ def test_parts_that_touch_in_a_point_are_two():
 
 
 def test_an_edge_that_touches_itself():
-    """Around a missing square whose corner is on the outline, both loops pass through one point."""
+    """Around a missing square with a corner on the outline, both loops pass through one point."""
     cells = [(i, j) for i in range(3) for j in range(3) if (i, j) not in ((1, 1), (2, 2))]
     parts = [pads.moved(pads.plate(5 * MM, 5 * MM), np.eye(3), np.array([5 * i, 5 * j, 0]) * MM) for i, j in cells]
     pad = unroll(Surface.joined(parts), *pads.upward(np.array([[2.0, 7.0]]) * MM), SIZE)
     np.testing.assert_allclose(area(pad), 175 * MM**2, rtol=EXACT)
 
 
-def test_a_quadratic_field_is_read_exactly():
-    """At taxels inside and, as by the same polynomial, just beside the meshed edge; a constant is read as it is."""
+def test_a_quadratic_field_is_interpolated_exactly():
+    """At taxels inside and, by the same polynomial, just outside the meshed edge; a constant is exact too."""
     pad = unroll(PLATES["fine"], *pads.upward(np.concatenate([GRID, [[25.04 * MM, 7.7 * MM]]])), SIZE)
     x, y = pad.basis.doflocs / MM
     at_x, at_y = places(pad).T / MM
     np.testing.assert_allclose(pad.at_taxels @ np.ones(pad.basis.N), 1, rtol=1e-12)
-    got = pad.at_taxels @ (x**2 - 3 * x * y + y + 2)
-    np.testing.assert_allclose(got, at_x**2 - 3 * at_x * at_y + at_y + 2, rtol=1e-10)
+    values = pad.at_taxels @ (x**2 - 3 * x * y + y + 2)
+    np.testing.assert_allclose(values, at_x**2 - 3 * at_x * at_y + at_y + 2, rtol=1e-10)
 
 
 @pytest.mark.parametrize("cells", [(64, 1), (64, 17), (300, 3)])
@@ -167,8 +167,8 @@ def test_a_half_cylinder_unrolls_to_its_arc(cells):
     np.testing.assert_allclose(np.hypot(*pad.edge_pos[:, :2].T), radius, atol=radius * facet**2)
 
 
-def test_a_triangle_without_area_does_no_harm():
-    """On a half cylinder, beside an edge that a vertex in its middle halves for one of its two triangles only."""
+def test_a_triangle_without_area_is_harmless():
+    """On a half cylinder, next to an edge that a midpoint splits for only one of its two triangles."""
     corners = pads.cylinder(cells=(16, 3)).corners
     a, b, c = corners[40]
     middle = (a + b) / 2
@@ -210,7 +210,7 @@ def test_a_cone_unrolls_to_a_sector():
 
 
 def test_a_shallow_cap_is_a_pad():
-    """Of half angle 0.3 the circumference is 1.5 % short of a flat disc's; along great circles lengths agree within 2 %."""
+    """At a half angle of 0.3 the circumference is 1.5 % short of a flat disc's; lengths along great circles agree within 2 %."""
     radius = 10 * MM
     polar, around = np.array([0.0, 0.1, 0.2, 0.28, 0.28]), np.array([0.0, 1.0, 2.5, 4.0, 5.5])
     normal = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], axis=1)
@@ -233,21 +233,21 @@ def test_taxels_off_a_coarse_cylinder_are_projected(offset):
 @pytest.mark.parametrize("facing", [(1, 0, 0), (0, 1, 0), (0, 0, -1)])
 @pytest.mark.parametrize("part", ["finger_link2", "thumb_link2"])
 def test_the_side_of_a_real_fingertip(part, facing):
-    """Ragged outlines, slivers and a slight double curvature: area and distances to neighbours keep within the 2 %."""
+    """Ragged outlines, slivers and a slight double curvature: area and distances to neighbours stay within 2 %."""
     body = trimesh.load_mesh(Path(__file__).parents[4] / "robots/xhand1/assets" / f"{part}.stl")
-    chosen = np.flatnonzero(body.face_normals @ facing > np.cos(np.radians(20)))
-    joined = body.face_adjacency[np.isin(body.face_adjacency, chosen).all(axis=1)]
-    held = max(trimesh.graph.connected_components(joined, nodes=chosen), key=lambda part: body.area_faces[part].sum())
-    at = held[np.argsort(-body.area_faces[held], kind="stable")[:12]]
-    pad = unroll(pads.soup(np.array(body.triangles[held])), body.triangles_center[at], body.face_normals[at], 0.4 * MM)
-    np.testing.assert_allclose(area(pad), body.area_faces[held].sum(), rtol=0.04)
+    candidates = np.flatnonzero(body.face_normals @ facing > np.cos(np.radians(20)))
+    joined = body.face_adjacency[np.isin(body.face_adjacency, candidates).all(axis=1)]
+    triangles = max(trimesh.graph.connected_components(joined, nodes=candidates), key=lambda part: body.area_faces[part].sum())
+    at = triangles[np.argsort(-body.area_faces[triangles], kind="stable")[:12]]
+    pad = unroll(pads.soup(np.array(body.triangles[triangles])), body.triangles_center[at], body.face_normals[at], 0.4 * MM)
+    np.testing.assert_allclose(area(pad), body.area_faces[triangles].sum(), rtol=0.04)
     assert_frames(pad.taxel_axes, body.face_normals[at])
     assert_frames(pad.edge_axes, pad.edge_normal)
     assert distances(pad.edge_pos).max() < 1.02 * distances(pad.basis.doflocs.T[pad.edge]).max()
 
 
-def strip_that_overlaps() -> Surface:
-    """One and a half turns of a ring, as a helix of 0.1 mm: it unrolls onto itself."""
+def overlapping_strip() -> Surface:
+    """Return one and a half turns of a ring, as a helix of 0.1 mm: it unrolls onto itself."""
     return pads.sheet(
         lambda r, a: np.stack([r * np.cos(a), r * np.sin(a), 0.1 * MM * a / (2 * np.pi)], axis=-1),
         np.linspace(5, 10, 6) * MM,
@@ -255,18 +255,18 @@ def strip_that_overlaps() -> Surface:
     )
 
 
-def folded() -> Surface:
-    """A flat plate whose last triangle lies folded back on it."""
+def folded_plate() -> Surface:
+    """Return a flat plate with its last triangle folded back on it."""
     back = np.array([[[25, 20, 0], [25, 0, 0], [15, 12, 0]]]) * MM
     return Surface.joined([pads.plate(), pads.soup(back)])
 
 
-def three_at_an_edge() -> Surface:
+def plate_with_fin() -> Surface:
     fin = np.array([[[25, 0, 0], [25, 20, 0], [25, 10, 9]], [[25, 0, 0], [25, 20, 0], [30, 10, 9]]]) * MM
     return Surface.joined([pads.plate(), pads.soup(fin)])
 
 
-def turned_over() -> Surface:
+def inconsistent_winding() -> Surface:
     return pads.soup(np.array([[[0, 0, 0], [25, 0, 0], [25, 20, 0]], [[0, 0, 0], [0, 20, 0], [25, 20, 0]]]) * MM)
 
 
@@ -274,7 +274,7 @@ def ball() -> Surface:
     return pads.soup(np.array(trimesh.creation.icosphere(subdivisions=3, radius=10 * MM).triangles))
 
 
-def apart() -> Surface:
+def separate_plates() -> Surface:
     return Surface.joined(
         [pads.plate(10 * MM, 20 * MM), pads.moved(pads.plate(10 * MM, 20 * MM), np.eye(3), np.array([15 * MM, 0, 0]))]
     )
@@ -297,12 +297,12 @@ REFUSED = {
         "cannot be unrolled.*does not close around",
     ),
     "a ball": (ball(), [[0, 0, 10]], "is closed: none of its 1280 triangles has an open edge.*select a part"),
-    "an overlap": (strip_that_overlaps(), [[7, 0.5, 0]], r"overlaps itself when it is unrolled, near \("),
-    "a fold": (folded(), [[5, 5, 0]], "folds over: 1 of its 3 triangles are upside down"),
-    "a fin": (three_at_an_edge(), [[5, 5, 0]], r"not a sheet: 3 triangles meet in one edge near \(25, "),
-    "wound against": (turned_over(), [[20, 2, 0]], r"not orientable: .* near \(.*counter-clockwise"),
+    "an overlap": (overlapping_strip(), [[7, 0.5, 0]], r"overlaps itself when it is unrolled, near \("),
+    "a fold": (folded_plate(), [[5, 5, 0]], "folds over: 1 of its 3 triangles are upside down"),
+    "a fin": (plate_with_fin(), [[5, 5, 0]], r"not a sheet: 3 triangles meet in one edge near \(25, "),
+    "wound against": (inconsistent_winding(), [[20, 2, 0]], r"not orientable: .* near \(.*counter-clockwise"),
     "two parts": (
-        apart(),
+        separate_plates(),
         [[5, 5, 0], [5, 6, 0], [20, 5, 0]],
         r"2 parts .* hold 2, 1 taxels: taxel 0 is on one, taxel 2 on another",
     ),
@@ -313,7 +313,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("surface", "at", "message"), REFUSED.values(), ids=REFUSED)
-def test_what_is_no_pad_is_refused(surface, at, message):
+def test_invalid_pads_are_refused(surface, at, message):
     pos = np.array(at, dtype=float) * MM
     with pytest.raises(LowerError, match=message) as caught:
         unroll(surface, pos, np.tile(pads.UP, (len(pos), 1)), SIZE)
