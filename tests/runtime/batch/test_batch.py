@@ -1,4 +1,4 @@
-"""The MuJoCo batch against MuJoCo's own functions on one `MjData` that is stepped in parallel, and against Newton."""
+"""The MuJoCo batch against MuJoCo's functions on a single `MjData` that takes the same steps, and against Newton."""
 
 import mujoco
 import numpy as np
@@ -14,7 +14,7 @@ from tgdsl.runtime.batch.simulation import BatchSimulation
 
 
 @pytest.mark.parametrize("substeps", [1, 5])
-def test_poses_and_velocities_are_those_of_mujocos_functions(tmp_path, substeps):
+def test_poses_and_velocities_match_mujocos_functions(tmp_path, substeps):
     touch, _ = arm(tmp_path)
     sim = BatchSimulation(touch, 2, substeps=substeps, keyframe="home")
     controls = np.random.default_rng(0).normal(size=(7, sim.model.nu))
@@ -30,7 +30,7 @@ def test_poses_and_velocities_are_those_of_mujocos_functions(tmp_path, substeps)
         np.testing.assert_allclose(value(state, "body_quat")[0, i], data.xquat[body], atol=TOLERANCE)
         np.testing.assert_allclose(value(state, "body_angvel")[0, i], velocity[:3], atol=1e-11)
         np.testing.assert_allclose(value(state, "body_linvel")[0, i], velocity[3:], atol=1e-11)
-        if name != "arm":  # the centre of mass is elsewhere and moves otherwise, or this would test nothing
+        if name != "arm":  # the centre of mass must move differently, or this would test nothing
             mujoco.mj_objectVelocity(sim.model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
             assert np.abs(velocity[3:] - value(state, "body_linvel")[0, i]).max() > 1e-3
 
@@ -57,9 +57,9 @@ def test_state_dtypes_and_fields(tmp_path):
     state = BatchSimulation(touch, 3, model=model).state()
     sizes = {"body": 2, "pair": 1, "slot": 4}
     for name in touch.inputs.fields:
-        found = getattr(state, name)
-        assert found.dtype == torch.float64
-        assert found.shape == (3, *(sizes.get(part, part) for part in SHAPES[name])), name
+        array = getattr(state, name)
+        assert array.dtype == torch.float64
+        assert array.shape == (3, *(sizes.get(part, part) for part in SHAPES[name])), name
     assert state.dt is None
     assert touch(state)["touch"].shape == (3, 2, 6)
 
@@ -70,8 +70,8 @@ def test_state_dtypes_and_fields(tmp_path):
 @pytest.mark.parametrize(
     ("pad", "item"), [("box", "sphere"), ("sphere", "box"), ("capsule", "box"), ("box", "box"), ("sphere", "sphere")]
 )
-def test_contacts_are_those_of_mujocos_functions(tmp_path, pad, item):
-    """MuJoCo orders the geoms of a contact by type: link and object come in either order, and the force must not care."""
+def test_contacts_match_mujocos_functions(tmp_path, pad, item):
+    """MuJoCo orders the geoms of a contact by type: link and object come in either order, with the same force."""
     path = scene(tmp_path, ARM.format(pad=pad, item=item))
     touch, model = wanting(module(path, ("item",)), path)
     sim = BatchSimulation(touch, 1, model=model, substeps=3, keyframe="home")
@@ -90,20 +90,20 @@ def test_contacts_are_those_of_mujocos_functions(tmp_path, pad, item):
     assert expected
     assert min(np.linalg.norm(force) for _, force, _, _ in expected) > 0.01
     assert value(state, "contact_found")[0, 0] == len(expected)
-    kept = expected[:4]
+    shown = expected[:4]
     for i, name in enumerate(("contact_pos", "contact_force", "contact_torque", "contact_normal")):
-        found = value(state, name)[0, 0]
-        order = [int(np.abs(value(state, "contact_pos")[0, 0] - row[0]).sum(axis=1).argmin()) for row in kept]
-        assert sorted(order) == list(range(len(kept)))
-        np.testing.assert_allclose(found[order], [row[i] for row in kept], atol=1e-9)
-        assert not found[len(kept) :].any()  # empty slots are zero
+        array = value(state, name)[0, 0]
+        order = [int(np.abs(value(state, "contact_pos")[0, 0] - row[0]).sum(axis=1).argmin()) for row in shown]
+        assert sorted(order) == list(range(len(shown)))
+        np.testing.assert_allclose(array[order], [row[i] for row in shown], atol=1e-9)
+        assert not array[len(shown) :].any()  # empty slots are zero
     if len(expected) <= 4:
         np.testing.assert_allclose(value(state, "contact_netforce")[0, 0], sum(row[1] for row in expected), atol=1e-9)
-    # It pushes the link away from the object.
+    # The force pushes the link away from the object.
     assert all(row[1] @ row[3] > 0 for row in expected)
 
 
-def test_pose_and_contact_are_of_one_instant(tmp_path):
+def test_poses_and_contacts_share_one_instant(tmp_path):
     path = scene(tmp_path, ARM.format(pad="box", item="sphere"))
     touch, model = wanting(module(path, ("item",)), path)
     sim = BatchSimulation(touch, 1, model=model, substeps=4, keyframe="home")
@@ -123,7 +123,7 @@ def test_pose_and_contact_are_of_one_instant(tmp_path):
 
 
 @pytest.mark.parametrize("angle", [0.0, 20.0], ids=["level", "tilted"])
-def test_a_resting_cube_weighs_what_it_weighs(tmp_path, angle):
+def test_a_resting_cube_presses_with_its_weight(tmp_path, angle):
     place = Rotation.from_euler("y", angle, degrees=True)
     pos = place.apply([0, 0, 0.03])
     text = PAD.format(mount=f"euler='0 {angle} 0'", place=f"pos='{pos[0]} 0 {pos[2]}' euler='0 {angle} 0'")
@@ -142,7 +142,7 @@ def test_a_resting_cube_weighs_what_it_weighs(tmp_path, angle):
         np.testing.assert_allclose(row, normal, atol=1e-3)
     shear = value(state, "contact_netforce")[0, 0] - value(state, "contact_netforce")[0, 0] @ normal * normal
     np.testing.assert_allclose(np.linalg.norm(shear), WEIGHT * np.sin(np.radians(angle)), atol=1e-3)
-    # The moment of the contacts about the centre of the cube vanishes: nothing turns.
+    # The contacts' moment about the cube's centre vanishes.
     arms = value(state, "contact_pos")[0, 0] - value(state, "body_pos")[0, touch.inputs.bodies.index("cube")]
     moment = (np.cross(arms, value(state, "contact_force")[0, 0]) + value(state, "contact_torque")[0, 0]).sum(axis=0)
     np.testing.assert_allclose(moment, 0, atol=1e-6)
@@ -157,7 +157,7 @@ def test_no_contact_reads_zero(tmp_path):
         assert not getattr(sim.state(), name).any(), name
 
 
-def test_the_net_force_knows_what_the_slots_do_not(tmp_path):
+def test_the_net_force_includes_contacts_without_a_slot(tmp_path):
     path = scene(tmp_path, PAD.format(mount="", place="pos='0 0 .03'"))
     touch, model = wanting(module(path), path, slots=1)
     sim = BatchSimulation(touch, 1, model=model, substeps=500)

@@ -1,4 +1,4 @@
-"""MuJoCo before 3.17 has no `mujoco.batch`: all but simulating on a CPU goes without."""
+"""MuJoCo before 3.17 has no `mujoco.batch`: everything works except simulating on the CPU."""
 
 import sys
 
@@ -10,7 +10,7 @@ import tgdsl
 from tgdsl.errors import SimulationError
 
 
-def test_it_compiles_and_reads_and_says_what_it_needs_to_simulate(tmp_path, monkeypatch):
+def test_older_mujoco_compiles_and_reads_but_cannot_simulate(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco.batch", None)  # importing it is an error
     if mujoco.__version__ >= "3.17":
         monkeypatch.setattr(mujoco, "__version__", "3.16.0")

@@ -1,4 +1,4 @@
-"""The MuJoCo batch: environments stepped and reset as if each were alone, and what cannot be stepped."""
+"""The MuJoCo batch: environments step and reset independently; invalid arguments are refused."""
 
 import mujoco
 import numpy as np
@@ -13,7 +13,7 @@ from tgdsl.runtime.connect import simulate
 # stepping and resetting
 
 
-def test_many_environments_are_as_many_single_ones(tmp_path):
+def test_environments_match_single_simulations(tmp_path):
     path = scene(tmp_path, ARM.format(pad="box", item="box"))
     touch, model = wanting(module(path, ("item",)), path)
     controls = np.random.default_rng(1).normal(size=(6, 5, model.nu))
@@ -32,7 +32,7 @@ def test_many_environments_are_as_many_single_ones(tmp_path):
 @pytest.mark.parametrize(
     "ids", [[1, 3], torch.tensor([1, 3]), np.array([1, 3]), [False, True, False, True], torch.tensor([0, 1, 0, 1]).bool()]
 )
-def test_reset_starts_the_named_environments_and_no_others(tmp_path, ids):
+def test_reset_restarts_the_chosen_environments_and_no_others(tmp_path, ids):
     path = scene(tmp_path, ARM.format(pad="box", item="sphere"))
     touch, model = wanting(module(path, ("item",)), path)
     sim = BatchSimulation(touch, 4, model=model, keyframe="home")
@@ -47,14 +47,14 @@ def test_reset_starts_the_named_environments_and_no_others(tmp_path, ids):
         np.testing.assert_array_equal(value(after, name)[[1, 3]], value(start, name)[[1, 3]], err_msg=name)
     np.testing.assert_array_equal(sim.batch.qpos[[0, 2]], qpos[[0, 2]])
     np.testing.assert_array_equal(sim.batch.ctrl[[1, 3]], 0)
-    sim.step()  # and the reset ones go on as new ones do
+    sim.step()  # the reset ones go on like new ones
     fresh = BatchSimulation(touch, 1, model=model, keyframe="home")
     fresh.step()
     np.testing.assert_array_equal(sim.batch.qpos[1], fresh.batch.qpos[0])
 
 
 @pytest.mark.parametrize("ids", [[3, 1], torch.tensor([3, 1, 3]), np.array([3, 1])])
-def test_environments_are_reset_in_any_order(tmp_path, ids):
+def test_the_order_of_reset_environments_does_not_matter(tmp_path, ids):
     touch, _ = arm(tmp_path)
     sims = [BatchSimulation(touch, 4, keyframe="home") for _ in range(2)]
     for sim, chosen in zip(sims, (ids, [1, 3]), strict=True):
@@ -76,7 +76,7 @@ def test_reset_of_none_does_nothing(tmp_path, ids):
 
 
 @pytest.mark.parametrize("ids", [[3], [-1], [True, False], np.array([0.5])])
-def test_reset_of_what_is_not_there(tmp_path, ids):
+def test_reset_of_unknown_environments_is_refused(tmp_path, ids):
     touch, _ = arm(tmp_path)
     sim = BatchSimulation(touch, 3, keyframe="home")
     with pytest.raises(SimulationError, match=r"^env_ids: found .*, expected indices from 0 to 2, or a mask of 3$"):
@@ -95,20 +95,20 @@ def test_reset_reaches_the_module(tmp_path):
     assert not bits.any()
 
 
-def test_keyframes(tmp_path):
+def test_environments_start_at_the_keyframe(tmp_path):
     touch, _ = arm(tmp_path)
     sim = BatchSimulation(touch, 2, keyframe="far")
     np.testing.assert_array_equal(sim.batch.qpos[1], sim.model.key("far").qpos)
     np.testing.assert_array_equal(sim.batch.ctrl, [[0.1, -0.1]] * 2)
     np.testing.assert_allclose(value(sim.state(), "body_pos")[:, touch.inputs.bodies.index("item")], [[3, 0, 0]] * 2)
-    own = BatchSimulation(touch, 1)
-    np.testing.assert_array_equal(own.batch.qpos[0], own.model.qpos0)
+    plain = BatchSimulation(touch, 1)
+    np.testing.assert_array_equal(plain.batch.qpos[0], plain.model.qpos0)
     with pytest.raises(SimulationError) as caught:
         simulate(touch, 1, keyframe="hme")
     assert str(caught.value) == 'the scene has no keyframe "hme"; did you mean "home"?'
 
 
-def test_controls(tmp_path):
+def test_controls_are_broadcast_and_kept(tmp_path):
     touch, _ = arm(tmp_path)
     sim = BatchSimulation(touch, 3, substeps=2, keyframe="home")
     assert sim.control_step == pytest.approx(0.004)
@@ -121,7 +121,7 @@ def test_controls(tmp_path):
     np.testing.assert_allclose(sim.batch.time, 3 * 0.004)
 
 
-def test_bad_controls_step_nothing(tmp_path):
+def test_invalid_controls_take_no_step(tmp_path):
     touch, _ = arm(tmp_path)
     sim = BatchSimulation(touch, 3, keyframe="home")
     before = sim.batch.qpos.copy()
@@ -151,10 +151,10 @@ def test_a_diverging_environment_is_reported(tmp_path, monkeypatch):
     assert np.isfinite(sim.batch.qpos).all()
 
 
-# what a scene lacks
+# scenes that lack something
 
 
-def test_a_model_of_your_own_needs_the_contact_sensors(tmp_path):
+def test_a_users_model_needs_the_contact_sensors(tmp_path):
     path = scene(tmp_path, PAD.format(mount="", place="pos='0 0 .03'"))
     touch = module(path)
     with pytest.raises(SimulationError) as caught:
@@ -165,7 +165,7 @@ def test_a_model_of_your_own_needs_the_contact_sensors(tmp_path):
     )
 
 
-def test_a_model_of_your_own_needs_the_bodies(tmp_path):
+def test_a_users_model_needs_the_bodies(tmp_path):
     path = scene(tmp_path, PAD.format(mount="", place="pos='0 0 .03'"))
     touch = module(path)
     other = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body name='cub'/></worldbody></mujoco>")
@@ -175,7 +175,7 @@ def test_a_model_of_your_own_needs_the_bodies(tmp_path):
 
 
 @pytest.mark.parametrize("keys", [{"num_envs": 0}, {"num_envs": "2"}, {"num_envs": 1, "substeps": 0}])
-def test_nothing_to_step(tmp_path, keys):
+def test_numbers_of_environments_and_substeps_are_checked(tmp_path, keys):
     touch, _ = arm(tmp_path)
     name, value = list(keys.items())[-1]
     with pytest.raises(SimulationError, match=f"^{name} is {value!r}, expected a whole number of at least 1$"):
@@ -189,12 +189,12 @@ def test_rk4_is_refused_because_its_poses_and_contacts_are_of_two_instants(tmp_p
     data = mujoco.MjData(model)
     data.qvel[0] = 1
     mujoco.mj_step(model, data)
-    assert data.body("cube").xpos[0] > 1e-3  # not where the contacts were found: there is the oracle
+    assert data.body("cube").xpos[0] > 1e-3  # not where the contacts were found
     with pytest.raises(SimulationError, match=r"^with the integrator RK4 MuJoCo's poses and contacts are of two instants"):
         simulate(touch, 1)
 
 
-def test_bodies_that_a_scene_lacks_are_called_bodies(tmp_path):
+def test_an_error_about_a_missing_body_lists_the_bodies(tmp_path):
     touch, _ = arm(tmp_path)
     other = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body name='zzz'/></worldbody></mujoco>")
     with pytest.raises(SimulationError, match=r'^the scene has no body "arm"; known bodies: world, zzz$'):

@@ -1,4 +1,4 @@
-"""Environments that diverge or are given what is not finite: named, restarted by choice, and of no concern to the others."""
+"""Environments that diverge or get values that are not finite: named, restarted on request, without effect on the others."""
 
 import warnings
 
@@ -20,12 +20,12 @@ SAID = r"^environments had faults and were restarted: {}; shown once, `fault_cou
 
 
 @pytest.fixture(autouse=True)
-def _elsewhere(tmp_path, monkeypatch):
+def _in_a_temporary_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log into the current folder
 
 
 def assert_same(sim, env, other, env_there, fields) -> None:
-    """Assert that two environments are alike, bit for bit."""
+    """Assert that two environments are bit-identical."""
     for name in ("qpos", "qvel", "ctrl"):
         assert torch.equal(getattr(sim, name)[env], getattr(other, name)[env_there]), name
     state, expected = sim.state(), other.state()
@@ -36,7 +36,7 @@ def assert_same(sim, env, other, env_there, fields) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("simulator", "substeps"), [(BatchSimulation, 1), (BatchSimulation, 4), (warp, 4)])
-def test_an_environment_that_diverges_is_started_anew_and_the_others_go_on(tmp_path, simulator, substeps):
+def test_a_diverged_environment_restarts_and_the_others_go_on(tmp_path, simulator, substeps):
     touch, keys = module(tmp_path), {"keyframe": "home", "substeps": substeps}
     sim, twin = simulator(touch, 4, on_fault="reset", **keys), simulator(touch, 4, **keys)
     for i, control in enumerate(CONTROLS):
@@ -55,17 +55,17 @@ def test_an_environment_that_diverges_is_started_anew_and_the_others_go_on(tmp_p
             assert_same(sim, env, twin, env, touch.inputs.fields)
     assert sim.fault_counts.tolist() == [0, 1, 0, 1]
     sim.qvel[1] = torch.nan
-    sim.step()  # nothing is said a second time
+    sim.step()  # no second warning
     assert sim.fault_counts.tolist() == [0, 2, 0, 1] and sim.faults.tolist() == [False, True, False, False]
 
 
 @BOTH
-def test_controls_that_are_not_finite_start_their_environment_anew(tmp_path, simulator):
+def test_controls_that_are_not_finite_restart_their_environment(tmp_path, simulator):
     touch = module(tmp_path)
     sim, twin = (simulator(touch, 3, keyframe="home", **keys) for keys in ({"on_fault": "reset"}, {}))
     good = np.random.default_rng(0).normal(size=(3, 2))
-    for one in (sim, twin):
-        one.step(good)
+    for each in (sim, twin):
+        each.step(good)
     with pytest.warns(UserWarning, match=SAID.format("2 had controls that are not finite")):
         sim.step(np.where([[True], [False], [False]], [[np.nan, 0.1]], np.where([[0], [0], [1]], np.inf, good)))
     twin.step(good)
@@ -74,14 +74,14 @@ def test_controls_that_are_not_finite_start_their_environment_anew(tmp_path, sim
     assert torch.isfinite(sim.ctrl).all()
     for env in range(3):
         assert_same(sim, env, twin, env, touch.inputs.fields)
-    sim.step(np.array([np.nan, 0.0]))  # for all alike
+    sim.step(np.array([np.nan, 0.0]))  # for all environments
     assert sim.fault_counts.tolist() == [2, 1, 2]
     for env in range(3):
         assert_same(sim, env, simulator(touch, 1, keyframe="home"), 0, touch.inputs.fields)
 
 
 @BOTH
-def test_what_a_module_remembers_of_a_faulty_environment_is_forgotten(tmp_path, simulator):
+def test_a_module_forgets_a_faulty_environment(tmp_path, simulator):
     noise = {"read_delay": "4 ms"}
     touch = module(tmp_path, PRESSED, links=("table",), noise=noise)
     other = module(tmp_path, PRESSED, links=("table",), noise=noise)
@@ -116,7 +116,7 @@ SLIDER = """
 
 @BOTH
 def test_a_divergence_in_one_of_many_physics_steps_counts(tmp_path, simulator):
-    """Damping brings the speed below the limit again before the control step ends; MuJoCo on the CPU begins again by itself."""
+    """Damping brings the speed below the limit before the control step ends; MuJoCo on the CPU restarts on its own."""
     touch = module(tmp_path, SLIDER, links=("table",))
     plain, sim = warp(touch, 2), simulator(touch, 2, substeps=5, on_fault="reset")
     plain.qvel[1] = sim.qvel[1] = 3e10
@@ -132,8 +132,8 @@ def test_a_divergence_in_one_of_many_physics_steps_counts(tmp_path, simulator):
 
 
 @BOTH
-def test_in_substates_a_module_begins_one_episode_per_fault(tmp_path, simulator):
-    """Not another one at each physics step that follows: gains would be redrawn, and delays never fill."""
+def test_a_fault_in_substates_starts_one_episode(tmp_path, simulator):
+    """Another one at each later physics step would redraw gains, and delays would never fill."""
     touch = module(tmp_path, noise={"gain": [0.5, 2.0], "read_delay": "4 ms"})
     sim = simulator(touch, 3, keyframe="home", substeps=4, on_fault="reset")
     control = torch.zeros(3, 2, dtype=torch.float64)
@@ -150,7 +150,7 @@ def test_in_substates_a_module_begins_one_episode_per_fault(tmp_path, simulator)
 
 
 @BOTH
-def test_in_substates_an_environment_starts_anew_where_its_fault_is(tmp_path, simulator):
+def test_substates_restart_an_environment_at_its_fault(tmp_path, simulator):
     touch = module(tmp_path)
     sim = simulator(touch, 3, keyframe="home", substeps=5, on_fault="reset")
     fresh = simulator(touch, 1, keyframe="home")
@@ -165,10 +165,10 @@ def test_in_substates_an_environment_starts_anew_where_its_fault_is(tmp_path, si
         fresh.step()
         assert_same(sim, 2, fresh, 0, touch.inputs.fields)
     assert next(states, None) is None
-    assert sim.faults.tolist() == [False, False, True]  # of the whole control step
+    assert sim.faults.tolist() == [False, False, True]  # for the whole control step
 
 
-def test_stepping_and_reading_in_one_reads_the_new_episode(tmp_path):
+def test_step_and_read_reads_the_new_episode(tmp_path):
     noise = {"read_delay": "4 ms"}
     modules = [module(tmp_path, PRESSED, noise=noise) for _ in range(2)]
     sim, twin = (warp(touch, 3, keyframe="home", substeps=2, on_fault="reset") for touch in modules)
@@ -177,19 +177,19 @@ def test_stepping_and_reading_in_one_reads_the_new_episode(tmp_path):
             sim.qvel[1, 0] = twin.qvel[1, 0] = torch.nan
         with warnings.catch_warnings():
             warnings.simplefilter("error" if i != 2 else "ignore")
-            found = sim.step_and_read(CONTROLS[i])["touch"]
+            reading = sim.step_and_read(CONTROLS[i])["touch"]
             twin.step(CONTROLS[i])
-        assert torch.equal(found, modules[1](twin.state())["touch"]) and torch.isfinite(found).all()
+        assert torch.equal(reading, modules[1](twin.state())["touch"]) and torch.isfinite(reading).all()
     assert sim.fault_counts.tolist() == [0, 1, 0]
 
 
 @BOTH
-def test_faults_wait_for_a_reset_unless_they_shall_not(tmp_path, simulator):
+def test_faults_wait_for_a_reset_by_default(tmp_path, simulator):
     touch = module(tmp_path)
     sim = simulator(touch, 3, keyframe="home")
     assert not sim.faults.any()
     sim.qvel[1, 0] = torch.nan
-    for _ in range(2):  # as long as it is not reset
+    for _ in range(2):  # until it is reset
         with pytest.raises(SimulationError, match=r"^environments 1 diverged.*; reset them to go on$"):
             sim.step()
         assert sim.faults.tolist() == [False, True, False]
@@ -199,12 +199,12 @@ def test_faults_wait_for_a_reset_unless_they_shall_not(tmp_path, simulator):
     sim.step()
     with pytest.raises(SimulationError, match=r"^control is not finite in environments 2$"):
         sim.step(np.array([[0, 0], [0, 0], [0, np.nan]]))
-    assert not sim.faults.any()  # it was refused, and nothing has happened
+    assert not sim.faults.any()  # the control was refused before any step
 
 
 @BOTH
-def test_controls_in_another_unit_are_warned_of_once(tmp_path, simulator):
-    """Controls of 90 degrees; motors without a range take any."""
+def test_clipped_controls_are_warned_of_once(tmp_path, simulator):
+    """A control in degrees; motors without a range accept any value."""
     scene = SCENE.replace("</actuator>", '<position name="turn" joint="two" ctrlrange="-1.5 1.5"/></actuator>')
     scene = scene.replace('ctrl=".1 -.1"', 'ctrl=".1 -.1 0"')
     sim = simulator(module(tmp_path, scene), 3)
@@ -220,7 +220,7 @@ def test_controls_in_another_unit_are_warned_of_once(tmp_path, simulator):
 
 
 @BOTH
-def test_a_reset_of_faulty_environments_may_say_where_they_begin(tmp_path, simulator):
+def test_reset_of_faulty_environments_accepts_values(tmp_path, simulator):
     touch = module(tmp_path)
     sim = simulator(touch, 3, keyframe="home", on_fault="reset")
     sim.qvel[1, 0] = torch.nan
@@ -230,7 +230,7 @@ def test_a_reset_of_faulty_environments_may_say_where_they_begin(tmp_path, simul
     assert sim.qvel[1].tolist() == [0.0] * 8 and sim.qvel[0].any() and not sim.faults.any()
 
 
-def test_pools_that_overflow_raise_whatever_becomes_of_faults(tmp_path):
+def test_overflowing_pools_raise_for_any_on_fault(tmp_path):
     sim = warp(module(tmp_path), 2, njmax=5, on_fault="reset")
     with pytest.raises(SimulationError, match=r"^MuJoCo Warp: njmax=5 is too small in environments 0, 1"):
         sim.step()
@@ -238,8 +238,8 @@ def test_pools_that_overflow_raise_whatever_becomes_of_faults(tmp_path):
 
 
 @pytest.mark.parametrize("on_fault", ["raise", "note", "reset"])
-def test_a_search_that_runs_out_of_room_is_a_fault_of_its_environment(tmp_path, on_fault):
-    """No pool is too small, and nobody can make it larger: one of thousands of environments stops nobody else."""
+def test_an_overflowing_search_is_a_fault_of_its_environment(tmp_path, on_fault):
+    """Users cannot enlarge this buffer, and one environment in thousands must not stop the others."""
     sim = warp(module(tmp_path), 3, keyframe="home", on_fault=on_fault)
     sim.arrays["overflow"][1] = 1 << 8
     text = "the search for the deepest point of two convex shapes ran out of room"
@@ -267,7 +267,7 @@ def test_a_search_that_runs_out_of_room_is_a_fault_of_its_environment(tmp_path, 
         ),
     ],
 )
-def test_what_a_gpu_notes_without_waiting_is_named_later(tmp_path, kind, text):
+def test_faults_noted_on_the_gpu_are_named_later(tmp_path, kind, text):
     sim = warp(module(tmp_path), 3, keyframe="home")
     sim._faults.note(kind, torch.tensor([False, True, False]))
     with pytest.raises(SimulationError) as caught:
@@ -275,8 +275,8 @@ def test_what_a_gpu_notes_without_waiting_is_named_later(tmp_path, kind, text):
     assert str(caught.value) == text
 
 
-def test_values_that_a_gpu_finds_bad_are_left_out(tmp_path):
-    """What the device judges, without the host: the rows that are good are set, the bad ones are noted."""
+def test_values_that_the_gpu_finds_invalid_are_left_out(tmp_path):
+    """The device decides without the host: valid rows are set, invalid ones are noted."""
     sim = warp(module(tmp_path), 4, keyframe="home")
     qpos = torch.from_numpy(np.tile(sim.model.qpos0, (4, 1)))
     qpos[0, 3:7], qpos[1, 0], qpos[3, 0] = 0.0, torch.nan, torch.nan
@@ -288,12 +288,12 @@ def test_values_that_a_gpu_finds_bad_are_left_out(tmp_path):
     assert sim.faults.tolist() == [True, True, False, False]
 
 
-def test_what_becomes_of_faults_is_one_of_two():
+def test_an_unknown_on_fault_is_refused():
     with pytest.raises(SimulationError, match=r'^on_fault is "rest"; did you mean "reset"\?$'):
         EnvFaults(2, torch.device("cpu"), "rest")
 
 
-def test_simulate_hands_it_on(tmp_path):
+def test_simulate_passes_on_fault_on(tmp_path):
     sim = tgdsl.simulate(module(tmp_path), 2, on_fault="reset")
     sim.qvel[0] = torch.nan
     with pytest.warns(UserWarning, match="1 diverged"):

@@ -1,4 +1,4 @@
-"""Temperatures and materials of objects as fields of a state: whose they are, what they may hold, and both simulators."""
+"""Temperatures and materials of objects as fields of a state, on both simulators."""
 
 import numpy as np
 import pytest
@@ -53,7 +53,7 @@ def simulator(kind, touch, num_envs, **options):
 BOTH = pytest.mark.parametrize("kind", ["batch", "warp"])
 
 
-def test_what_is_wanted(tmp_path):
+def test_inputs_list_heated_objects(tmp_path):
     touch = compiled(tmp_path)
     assert touch.inputs.fields[-2:] == ("object_temperature", "object_material")
     assert touch.inputs.heated == ("free", "kind", "warm")
@@ -66,8 +66,8 @@ def test_what_is_wanted(tmp_path):
 @pytest.mark.parametrize(
     ("feels", "fields"), [(["kind"], {"object_material"}), (["warm"], {"object_temperature"}), ([], set())], ids=str
 )
-def test_fields_are_wanted_by_those_who_read_them(tmp_path, feels, fields):
-    """An object that only other sensors feel, or that is the same everywhere, asks for nothing."""
+def test_a_module_wants_only_the_fields_that_its_sensors_read(tmp_path, feels, fields):
+    """An object that only other sensors feel, or that is equal in all environments, needs no field."""
     inputs = compiled(tmp_path, feels=feels).inputs
     assert {name for name in inputs.fields if name.startswith("object_")} == fields
     assert inputs.heated == (tuple(feels) if fields else ())
@@ -75,7 +75,7 @@ def test_fields_are_wanted_by_those_who_read_them(tmp_path, feels, fields):
     assert compiled(tmp_path, objects=plain, feels=["only"]).inputs.heated == ()
 
 
-def test_readings_are_the_references(tmp_path):
+def test_readings_agree_with_the_reference(tmp_path):
     doc = document(tmp_path)
     touch = tgdsl.compile(doc, kinds=[THERMOMETER], dtype=torch.float64)
     state = touch.example_state(6)
@@ -85,13 +85,15 @@ def test_readings_are_the_references(tmp_path):
     readings = touch(state)
     for name in ("free", "kind", "warm"):
         spec = THERMOMETER.spec.model_validate(doc["sensors"][name])
-        own = tgdsl.compile({**doc, "sensors": {name: doc["sensors"][name]}}, kinds=[THERMOMETER], dtype=torch.float64)
-        alone = own.example_state(6)
-        assert_agrees(own(alone)[name], ReferenceModule(own.plan, THERMOMETER, spec), alone, FLOAT64_TOLERANCE)
+        single = tgdsl.compile({**doc, "sensors": {name: doc["sensors"][name]}}, kinds=[THERMOMETER], dtype=torch.float64)
+        single_state = single.example_state(6)
+        assert_agrees(
+            single(single_state)[name], ReferenceModule(single.plan, THERMOMETER, spec), single_state, FLOAT64_TOLERANCE
+        )
     assert readings["kind"][:, 0].tolist() == [[60.0, 401.0], [60.0, 0.2]] * 3
 
 
-def test_an_artefact_knows_them_all(tmp_path):
+def test_an_artefact_keeps_heated_objects(tmp_path):
     touch = compiled(tmp_path)
     tgdsl.save(touch, tmp_path / "a.safetensors")
     again = tgdsl.load(tmp_path / "a.safetensors", kinds=[THERMOMETER], dtype=torch.float64)
@@ -104,7 +106,7 @@ def test_an_artefact_knows_them_all(tmp_path):
         type(touch.plan).from_json(touch.plan.to_json().replace(f'"format":{FORMAT}', '"format":12'), touch.plan.arrays)
 
 
-def test_what_a_state_may_hold(tmp_path):
+def test_dtypes_shapes_and_ranges_of_a_state_are_checked(tmp_path):
     touch = compiled(tmp_path)
     state = touch.example_state(4)
     moved = state.to(torch.float32)
@@ -127,22 +129,22 @@ def test_what_a_state_may_hold(tmp_path):
 
 
 @BOTH
-def test_environments_begin_as_the_document_says(tmp_path, kind):
+def test_environments_start_with_the_documents_values(tmp_path, kind):
     sim = simulator(kind, compiled(tmp_path), 4)
     state = sim.state()
     np.testing.assert_allclose(state.object_temperature, [[45, 0, 26.85]] * 4, rtol=1e-7)
     assert state.object_material.tolist() == [[0, 0, 0], [1, 1, 0], [2, 0, 0], [0, 1, 0]]
-    found = sim.read()["free"][:, 0]
-    np.testing.assert_allclose(found, [[45, OF_STEEL], [45, OF_WOOD], [45, OF_GLASS], [45, OF_STEEL]], rtol=1e-7)
+    readings = sim.read()["free"][:, 0]
+    np.testing.assert_allclose(readings, [[45, OF_STEEL], [45, OF_WOOD], [45, OF_GLASS], [45, OF_STEEL]], rtol=1e-7)
 
 
 @BOTH
-def test_what_is_set_stays_through_steps_and_resets(tmp_path, kind):
+def test_set_values_survive_steps_and_resets(tmp_path, kind):
     sim = simulator(kind, compiled(tmp_path), 3, keyframe="home")
-    handed_out, kept = sim.state(), (sim.heat.temperature, sim.heat.material)
+    first, live = sim.state(), (sim.heat.temperature, sim.heat.material)
     sim.set_objects(env_ids=[2, 0], temperatures={"free": [50, 10], "warm": -5.5}, materials={"free": [1, 2], "kind": 1})
     expected = [[10, 0, -5.5], [45, 0, 26.85], [50, 0, -5.5]], [[2, 1, 0], [1, 1, 0], [1, 1, 0]]
-    assert handed_out.object_material.tolist() == [[0, 0, 0], [1, 1, 0], [2, 0, 0]], "a state is a copy"
+    assert first.object_material.tolist() == [[0, 0, 0], [1, 1, 0], [2, 0, 0]], "a state is a copy"
     for act in (
         lambda: None,
         sim.step,
@@ -155,11 +157,11 @@ def test_what_is_set_stays_through_steps_and_resets(tmp_path, kind):
         state = sim.state()
         np.testing.assert_allclose(state.object_temperature, expected[0], rtol=1e-6)
         assert state.object_material.tolist() == expected[1]
-    assert sim.heat.temperature is kept[0] and sim.heat.material is kept[1], "written in place"
+    assert sim.heat.temperature is live[0] and sim.heat.material is live[1], "written in place"
 
 
 @BOTH
-def test_live_tensors_are_handed_out_with_the_next_state(tmp_path, kind):
+def test_values_written_into_live_tensors_are_in_the_next_state(tmp_path, kind):
     sim = simulator(kind, compiled(tmp_path), 3)
     place = sim.heat.names.index("warm")
     sim.heat.temperature[:, place] = torch.tensor([20.0, 30.0, 40.0])
@@ -169,7 +171,7 @@ def test_live_tensors_are_handed_out_with_the_next_state(tmp_path, kind):
 
 
 @BOTH
-def test_environments_that_are_set_begin_anew(tmp_path, kind):
+def test_set_objects_restarts_its_environments(tmp_path, kind):
     sim = simulator(kind, compiled(tmp_path), 3, keyframe="home")
     start = sim.qpos.clone()
     for _ in range(5):
@@ -180,7 +182,7 @@ def test_environments_that_are_set_begin_anew(tmp_path, kind):
     assert torch.equal(sim.qpos[1], start[1]) and torch.equal(sim.qpos[[0, 2]], moved[[0, 2]])
 
 
-def test_both_simulators_hand_out_the_same(tmp_path):
+def test_both_simulators_agree(tmp_path):
     sims = [simulator(kind, compiled(tmp_path), 5) for kind in ("batch", "warp")]
     rng = np.random.default_rng(3)
     for _ in range(3):
@@ -196,7 +198,7 @@ def test_both_simulators_hand_out_the_same(tmp_path):
 
 
 @BOTH
-def test_a_saved_simulation_goes_on_with_them(tmp_path, kind):
+def test_state_dict_restores_temperatures_and_materials(tmp_path, kind):
     touch = compiled(tmp_path)
     sim = simulator(kind, touch, 3)
     sim.set_objects(temperatures={"free": [1, 2, 3]}, materials={"free": [2, 1, 0]})
@@ -219,7 +221,7 @@ def test_a_saved_simulation_goes_on_with_them(tmp_path, kind):
 
 
 @BOTH
-def test_mistakes_change_nothing(tmp_path, kind):
+def test_invalid_values_change_nothing(tmp_path, kind):
     sim = simulator(kind, compiled(tmp_path), 3)
     before = sim.state_dict()
     for bad, message in (
@@ -253,8 +255,8 @@ def test_mistakes_change_nothing(tmp_path, kind):
         without.set_objects(temperatures={"free": 3})
 
 
-def test_variants_and_heat_in_one_call(tmp_path):
-    """Of an object with variants too: what does not fit of either leaves both as they were."""
+def test_variants_and_heat_are_set_in_one_call_or_not_at_all(tmp_path):
+    """An invalid value of one leaves both unchanged."""
     shapes = [{"type": "sphere", "size": [0.02]}, {"type": "box", "size": [0.02, 0.02, 0.02]}]
     objects = {**OBJECTS, "free": {**OBJECTS["free"], "variants": shapes}}
     sim = BatchSimulation(compiled(tmp_path, objects=objects), 4)
@@ -284,6 +286,6 @@ def test_one_compiled_graph_serves_all_materials(tmp_path):
     assert counters["stats"]["unique_graphs"] == 1 and not counters["graph_break"]
 
 
-def test_a_quantity_can_ask_for_a_material(tmp_path):
+def test_a_quantity_can_require_a_material(tmp_path):
     with pytest.raises(SpecError, match=r"objects\.cold: expected `material`, what it is made of"):
         compiled(tmp_path, feels=["cold"])

@@ -1,6 +1,6 @@
-"""Joints and controls of a state, against MuJoCo's own functions: of the instant of the poses, in both simulators.
+"""Joints and controls of a state, at the instant of its poses, against MuJoCo's functions on both simulators.
 
-The oracle is `mj_forward` on one `MjData` that has the state's own joints: poses, velocities and actuator forces must follow.
+The oracle is `mj_forward` on one `MjData` with the state's joints: poses, velocities and actuator forces must follow.
 """
 
 import re
@@ -23,7 +23,7 @@ from tgdsl.view.table import table
 TERMS = {"policy": [*ALL, {"type": "joint_pos", "joints": ["passive"]}]}
 JOINTS = (*ACTUATED, "passive")
 TOLERANCE = {BatchSimulation: 1e-12, WarpSimulation: 2e-5}
-"""float64 and the same functions; float32, relative to the largest number."""
+"""float64 with the same functions; float32, relative to the largest number."""
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +37,8 @@ def simulation(kind, touch, num_envs, **options):
     return BatchSimulation(touch, num_envs, keyframe="home", **options)
 
 
-def stepped(controls, substeps):
-    """Return MuJoCo's data after control steps, as it is left: poses of the start of the last physics step."""
+def data_after(controls, substeps):
+    """Return MuJoCo's data after control steps, with the poses at the start of the last physics step."""
     model = mujoco.MjModel.from_xml_string(SCENE_XML)
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
@@ -52,7 +52,7 @@ def stepped(controls, substeps):
     return model, data, before
 
 
-def expected(model, data, before):
+def expected_fields(model, data, before):
     qpos, qvel, ctrl = before
     joints = [model.joint(name).id for name in JOINTS]
     dofs = model.jnt_dofadr[joints]
@@ -65,10 +65,10 @@ def expected(model, data, before):
     }
 
 
-def assert_is(state, env, wanted, tolerance):
-    for name, values in wanted.items():
-        found = getattr(state, name)[env].double().numpy()
-        np.testing.assert_allclose(found, values, rtol=0, atol=tolerance * max(1.0, np.abs(values).max()), err_msg=name)
+def assert_fields(state, env, expected, tolerance):
+    for name, values in expected.items():
+        array = getattr(state, name)[env].double().numpy()
+        np.testing.assert_allclose(array, values, rtol=0, atol=tolerance * max(1.0, np.abs(values).max()), err_msg=name)
 
 
 CONTROLS = np.random.default_rng(0).normal(scale=0.2, size=(5, 4))
@@ -76,18 +76,18 @@ CONTROLS = np.random.default_rng(0).normal(scale=0.2, size=(5, 4))
 
 @pytest.mark.parametrize("kind", [BatchSimulation, WarpSimulation])
 @pytest.mark.parametrize("substeps", [1, 4])
-def test_joints_are_those_of_mujoco_at_the_instant_of_the_poses(touch, kind, substeps):
+def test_joints_match_mujoco_at_the_instant_of_the_poses(touch, kind, substeps):
     sim = simulation(kind, touch, 2, substeps=substeps)
-    assert_is(sim.state(), 0, expected(*stepped([], substeps)), TOLERANCE[kind])
+    assert_fields(sim.state(), 0, expected_fields(*data_after([], substeps)), TOLERANCE[kind])
     for control in CONTROLS:
         sim.step(control)
-    assert_is(sim.state(), 1, expected(*stepped(CONTROLS, substeps)), TOLERANCE[kind])
+    assert_fields(sim.state(), 1, expected_fields(*data_after(CONTROLS, substeps)), TOLERANCE[kind])
     assert touch.inputs.joints == JOINTS
 
 
 @pytest.mark.parametrize("kind", [BatchSimulation, WarpSimulation])
-def test_poses_and_forces_follow_from_the_joints_of_the_state(touch, kind):
-    """The state's own joints give its poses, velocities and efforts; those of `qpos`, a substep later, do not."""
+def test_poses_and_forces_follow_from_the_states_joints(touch, kind):
+    """The state's joints give its poses; `qpos`, a substep later, does not."""
     sim = simulation(kind, touch, 1, substeps=3)
     for control in CONTROLS:
         sim.step(control)
@@ -103,35 +103,35 @@ def test_poses_and_forces_follow_from_the_joints_of_the_state(touch, kind):
         mujoco.mj_forward(model, data)
         return data.body("tip").xpos
 
-    own = state.body_pos[0, touch.inputs.bodies.index("tip")].double().numpy()
-    np.testing.assert_allclose(tip_pos(state.joint_pos[0].double().numpy()), own, atol=TOLERANCE[kind])
+    tip = state.body_pos[0, touch.inputs.bodies.index("tip")].double().numpy()
+    np.testing.assert_allclose(tip_pos(state.joint_pos[0].double().numpy()), tip, atol=TOLERANCE[kind])
     later = [qpos[0, model.joint(name).qposadr[0]] for name in JOINTS]
-    assert np.abs(tip_pos(later) - own).max() > 1e-4
+    assert np.abs(tip_pos(later) - tip).max() > 1e-4
 
 
 @pytest.mark.parametrize("kind", [BatchSimulation, WarpSimulation])
-def test_a_reset_puts_its_own_environments_back_and_no_others(touch, kind):
+def test_reset_restores_the_chosen_environments_and_no_others(touch, kind):
     sim = simulation(kind, touch, 3, substeps=2)
     for control in CONTROLS:
         sim.step(control)
-    moving, start = expected(*stepped(CONTROLS, 2)), expected(*stepped([], 2))
+    moving, start = expected_fields(*data_after(CONTROLS, 2)), expected_fields(*data_after([], 2))
     sim.reset([1])
     state = sim.state()
-    for env, wanted in enumerate([moving, start, moving]):
-        assert_is(state, env, wanted, TOLERANCE[kind])
+    for env, expected in enumerate([moving, start, moving]):
+        assert_fields(state, env, expected, TOLERANCE[kind])
     sim.step(CONTROLS[0])
-    assert_is(sim.state(), 1, expected(*stepped(CONTROLS[:1], 2)), TOLERANCE[kind])
+    assert_fields(sim.state(), 1, expected_fields(*data_after(CONTROLS[:1], 2)), TOLERANCE[kind])
 
 
 @pytest.mark.parametrize("kind", [BatchSimulation, WarpSimulation])
-def test_every_substep_has_its_own(touch, kind):
+def test_every_substep_has_its_joints(touch, kind):
     sim = simulation(kind, touch, 1, substeps=3)
     for i, state in enumerate(sim.substates(CONTROLS[0])):
-        assert_is(state, 0, expected(*stepped([CONTROLS[0]], i + 1)), TOLERANCE[kind])
+        assert_fields(state, 0, expected_fields(*data_after([CONTROLS[0]], i + 1)), TOLERANCE[kind])
 
 
-def test_asking_changes_no_physics(tmp_path, touch):
-    """A control step is made in two parts where joints are kept between: to the last bit it is the same."""
+def test_reading_joints_does_not_change_the_physics(tmp_path, touch):
+    """A control step is split in two to store the joints between them; it stays bit-identical."""
     plain = joint_module(tmp_path, {"policy": [{"type": "joint_effort"}]})
     sims = [BatchSimulation(module, 2, substeps=5, keyframe="home") for module in (touch, plain)]
     for control in CONTROLS:
@@ -142,21 +142,21 @@ def test_asking_changes_no_physics(tmp_path, touch):
 
 
 def test_both_simulators_agree_through_the_module(touch):
-    """From the controls to the policy, stepped and read in one; a later step does not reach into an earlier state."""
+    """From controls to the policy's group, with `step_and_read`; later steps leave earlier states unchanged."""
     sim, cpu = (simulation(kind, touch, 2, substeps=2) for kind in (WarpSimulation, BatchSimulation))
-    kept = sim.state()
-    first = kept.joint_pos.clone()
+    start_state = sim.state()
+    first = start_state.joint_pos.clone()
     for control in CONTROLS:
         readings = sim.step_and_read(control)
         cpu.step(control)
-    other = touch(cpu.state())
+    expected = touch(cpu.state())
     for name in ("joint_pos", "joint_vel", "joint_effort", "last_action"):
-        torch.testing.assert_close(readings[name], other[name], rtol=1e-4, atol=1e-5)
-    assert (kept.joint_pos == first).all()
-    torch.testing.assert_close(touch.observe(readings)["policy"], touch.observe(other)["policy"], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(readings[name], expected[name], rtol=1e-4, atol=1e-5)
+    assert (start_state.joint_pos == first).all()
+    torch.testing.assert_close(touch.observe(readings)["policy"], touch.observe(expected)["policy"], rtol=1e-4, atol=1e-5)
 
 
-def test_a_reading_does_not_follow_the_simulation(touch):
+def test_readings_are_copies(touch):
     sim = BatchSimulation(touch, 1, keyframe="home")
     sim.step(CONTROLS[0])
     state, readings = sim.state(), touch(sim.state())
@@ -174,7 +174,7 @@ def test_a_reading_does_not_follow_the_simulation(touch):
         ('<joint name="passive" axis="1 0 0"', '<joint name="passive" type="ball"', 'joint "passive" is a ball or free joint'),
     ],
 )
-def test_a_model_of_ones_own_that_lacks_them(touch, kind, old, new, message):
+def test_a_users_model_must_have_the_joints_and_actuators(touch, kind, old, new, message):
     xml = SCENE_XML.replace(old, new)
     spec = mujoco.MjSpec.from_string(xml[: xml.index("<keyframe>")] + "</mujoco>")
     model = tgdsl.instrument(spec, touch.inputs).compile()
@@ -184,8 +184,8 @@ def test_a_model_of_ones_own_that_lacks_them(touch, kind, old, new, message):
         )
 
 
-def test_tables_and_pictures_are_of_links_alone(touch, tmp_path):
-    """Joints are on no link: they are kept with the readings of a rollout, and drawn nowhere."""
+def test_tables_and_pictures_show_links_only(touch, tmp_path):
+    """Joints are on no link: a rollout records them, and nothing draws them."""
     sim = BatchSimulation(touch, 1, keyframe="home")
     recorder = Recorder(touch, 2, 1)
     for step in rollout(touch, sim, CONTROLS[:2]):
@@ -201,19 +201,19 @@ def test_tables_and_pictures_are_of_links_alone(touch, tmp_path):
 
 
 @pytest.mark.parametrize("kind", [BatchSimulation, WarpSimulation])
-def test_where_objects_differ_the_robots_joints_are_the_same(tmp_path, kind):
-    """Environments with another object restart, at the keyframe's joints; the others stay where they were."""
+def test_environments_with_other_objects_keep_the_robots_joints(tmp_path, kind):
+    """Environments that get another object restart at the keyframe's joints; the others stay."""
     document = joint_document(tmp_path, TERMS)
-    still = (tmp_path / "robot.xml").read_text().replace("</worldbody>", f"{OBJECT}</worldbody>")
-    (tmp_path / "scene.xml").write_text(re.sub('<joint name="spin"[^>]*>', "", still))
+    text = (tmp_path / "robot.xml").read_text().replace("</worldbody>", f"{OBJECT}</worldbody>")
+    (tmp_path / "scene.xml").write_text(re.sub('<joint name="spin"[^>]*>', "", text))
     size = {"type": "box", "size": [0.02, 0.02, 0.02]}
     document["objects"]["item"]["variants"] = [size, {"type": "sphere", "size": [0.02]}]
     sim = simulation(kind, touch := tgdsl.compile(document), 3, substeps=2)
     for control in CONTROLS:
-        sim.step(np.delete(control, 1))  # that of the object, which moves nothing of the robot
+        sim.step(np.delete(control, 1))  # without the object's control, which does not move the robot
     sim.set_objects(variants={"item": 1}, env_ids=[2])
     state = sim.state()
     assert state.variant is not None and state.variant[:, 0].tolist() == [0, 1, 1]
-    for env, wanted in enumerate([expected(*stepped(CONTROLS, 2))] * 2 + [expected(*stepped([], 2))]):
-        assert_is(state, env, wanted, TOLERANCE[kind])
+    for env, expected in enumerate([expected_fields(*data_after(CONTROLS, 2))] * 2 + [expected_fields(*data_after([], 2))]):
+        assert_fields(state, env, expected, TOLERANCE[kind])
     assert touch.observe(touch(state))["policy"].shape == (3, 4 * 3 + 1)

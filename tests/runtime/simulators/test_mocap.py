@@ -1,4 +1,4 @@
-"""Mocap bodies: MuJoCo gives them no velocity, and tgdsl says so where one is wanted."""
+"""Mocap bodies: MuJoCo gives them no velocity, and tgdsl warns where a sensor needs one."""
 
 import warnings
 
@@ -27,7 +27,7 @@ def compiled(folder, kind):
 
 
 @pytest.mark.parametrize("simulator", ["cpu", pytest.param("warp", marks=pytest.mark.slow)])
-def test_velocities_of_a_mocap_body_are_warned_of(tmp_path, simulator):
+def test_a_sensor_that_needs_a_mocap_bodys_velocity_warns(tmp_path, simulator):
     from tgdsl.runtime.warp import WarpSimulation
 
     make = (
@@ -43,4 +43,4 @@ def test_velocities_of_a_mocap_body_are_warned_of(tmp_path, simulator):
     data = mujoco.MjData(sim.model)
     data.mocap_pos[0, 0] = 0.1
     mujoco.mj_step(sim.model, data)
-    assert not data.body("pad").cvel.any()  # which is why
+    assert not data.body("pad").cvel.any()  # MuJoCo gives no velocity

@@ -1,4 +1,4 @@
-"""One rigid body's force, whatever objects are made of its geoms and however many bodies it is welded of: m g, in both simulators."""
+"""A rigid body presses with m g on both simulators, for any objects made of its geoms and any welded bodies."""
 
 import mujoco
 import numpy as np
@@ -32,33 +32,30 @@ MUG = """
 </body>"""
 
 
-# Gaps
-
-
 GAPPED = '<body name="item" pos="0 0 {z}"><freejoint/><geom name="item" type="box" size=".02 .02 .02" mass=".3" {more}/></body>'
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("which", MODELS)
 def test_geoms_of_one_body_press_once(tmp_path, which):
-    """Two objects of one body: together its weight, the one it rests on its weight, the other nothing."""
+    """Two objects of one body: together they read its weight, the lower one alone too, the upper one nothing."""
     objects = {name: {"body": "item", "surface": name} for name in ("low", "high")}
     sensors = {
         f"{kind}_{i}": sensor
         for i, feels in enumerate((["low", "high"], ["high", "low"], ["low"], ["high"]))
         for kind, sensor in of_kinds(feels).items()
     }
-    found = pressed(compiled(tmp_path, TWO_GEOMS, objects, sensors), which)
+    loads = pressed(compiled(tmp_path, TWO_GEOMS, objects, sensors), which)
     for kind in ("link", "shared", "balanced"):
         for i in range(3):
-            assert found[f"{kind}_{i}"] == pytest.approx(LOAD, rel=RESTING)
-        assert found[f"{kind}_3"] == 0
+            assert loads[f"{kind}_{i}"] == pytest.approx(LOAD, rel=RESTING)
+        assert loads[f"{kind}_3"] == 0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("which", MODELS)
-def test_surfaces_that_are_only_seen_share_the_bodys_force(tmp_path, which):
-    """Whoever feels one of them, or both, is pressed by the weight: in two sensors as in one."""
+def test_visual_surfaces_share_the_bodys_force(tmp_path, which):
+    """A sensor that feels one of them, or both, reads the weight."""
     objects = {name: {"body": "item", "surface": name} for name in ("front", "back")} | {"whole": {"body": "item"}}
     groups = (["front", "back"], ["front"], ["back"], ["back", "whole", "front"])
     sensors = {f"{kind}_{i}": sensor for i, feels in enumerate(groups) for kind, sensor in of_kinds(feels).items()}
@@ -69,18 +66,18 @@ def test_surfaces_that_are_only_seen_share_the_bodys_force(tmp_path, which):
 
 
 @pytest.mark.slow
-def test_two_objects_of_one_body_share_what_warp_finds_of_it_only_where_they_are_one(tmp_path):
-    """A part, another one and the whole: a contact is in the rows of the part that it acts on and of the whole, in no other."""
+def test_warp_counts_a_contact_for_its_part_and_for_the_whole_body(tmp_path):
+    """Objects are two parts and the whole: a contact is in the rows of its part and of the whole, in no other."""
     objects = {name: {"body": "item", "surface": name} for name in ("low", "high")} | {"whole": {"body": "item"}}
     sensors = {name: {"kind": "link_contact", "feels": [name], "outputs": ["force"]} for name in objects}
     touch = compiled(tmp_path, TWO_GEOMS, objects, sensors)
     assert touch.inputs.contacts_of == {name: (ContactPart("geom", name),) for name in ("low", "high")}
-    found = pressed(touch, "warp")
-    assert found == {"low": pytest.approx(LOAD, rel=RESTING), "high": 0, "whole": found["low"]}
+    loads = pressed(touch, "warp")
+    assert loads == {"low": pytest.approx(LOAD, rel=RESTING), "high": 0, "whole": loads["low"]}
 
 
-def test_a_model_of_ones_own_is_given_the_parts_sensors(tmp_path):
-    """Instrumented with what a kept plan wants, it reads what the artefact's scene reads; a geom that it lacks is named."""
+def test_instrument_adds_the_sensors_of_object_parts_to_a_users_model(tmp_path):
+    """Instrumented for a loaded plan, it reads what the artefact's scene reads; an error names a missing geom."""
     objects = {name: {"body": "item", "surface": name} for name in ("low", "high")}
     sensors = {name: {"kind": "force_taxel", "feels": [name]} for name in objects}
     tgdsl.save(compiled(tmp_path, TWO_GEOMS, objects, sensors), tmp_path / "module.safetensors")
@@ -100,8 +97,8 @@ def test_a_model_of_ones_own_is_given_the_parts_sensors(tmp_path):
         warp(touch, 1, model=spec.compile())
 
 
-def test_surfaces_that_overlap_cannot_be_counted_once(tmp_path):
-    """Geoms a, b and b, c: no way to take both forces and b's once; of sensors apart, each has its own."""
+def test_overlapping_surfaces_in_one_sensor_are_refused(tmp_path):
+    """Two surfaces share a geom, whose force would count twice; in separate sensors they are fine."""
     body = TWO_GEOMS.replace("</body>", '<geom name="mid" type="box" size=".02 .02 .021" mass="0"/></body>')
     objects = {"one": {"body": "item", "surface": "[lm]*"}, "two": {"body": "item", "surface": "[mh]*"}}
     message = 'sensors.link.feels[1]: "two" and "one" share some of their geoms'
@@ -112,13 +109,13 @@ def test_surfaces_that_overlap_cannot_be_counted_once(tmp_path):
     compiled(tmp_path, body, objects, {"depth": {"kind": "contact_depth", "feels": ["one", "two"]}})  # reads no force
 
 
-def test_an_object_is_felt_once(tmp_path):
+def test_an_object_listed_twice_is_refused(tmp_path):
     with pytest.raises(SpecError, match=r'sensors\.link\.feels\[1\]: object "item" is listed twice; name it once'):
         compiled(tmp_path, TWO_GEOMS, {"item": {"body": "item"}}, {"link": of_kinds(["item", "item"])["link"]})
 
 
-def test_a_geom_without_a_name_is_asked_for_one(tmp_path):
-    """A mesh names its geom for the document, but not for MuJoCo's sensors; where nothing else collides none is needed."""
+def test_a_colliding_geom_needs_a_name(tmp_path):
+    """A mesh names its geom for the document, not for MuJoCo's sensors; no name is needed if nothing else collides."""
     asset = '<asset><mesh name="block" vertex="-1 -1 -1 1 -1 -1 -1 1 -1 -1 -1 1 1 1 1" scale=".02 .02 .02"/></asset>'
     body = TWO_GEOMS.replace('name="low" type="box" size=".02 .02 .02"', 'type="mesh" mesh="block"')
     objects = {"item": {"body": "item", "surface": "block"}}
@@ -135,7 +132,7 @@ def test_a_geom_without_a_name_is_asked_for_one(tmp_path):
 @pytest.mark.parametrize("which", MODELS)
 @pytest.mark.parametrize("slots", [False, True], ids=["bit", "slots"])
 def test_a_gap_is_no_contact(tmp_path, which, slots):
-    """2 mm above the pad, within a gap of 5 mm, MuJoCo reports contacts that carry nothing: a gate stays shut. At rest it opens."""
+    """2 mm above the pad, within a gap of 5 mm, MuJoCo reports contacts without force: gates stay shut. At rest they open."""
     sensors = {"depth": {"kind": "kinematic_taxel", "outputs": ["force"], "feels": ["item"]}}
     sensors |= of_kinds(["item"]) if slots else {}
     touch = compiled(tmp_path, GAPPED.format(z=".032", more='gap=".005"'), {"item": {"body": "item"}}, sensors)
@@ -154,8 +151,8 @@ def test_a_gap_is_no_contact(tmp_path, which, slots):
 
 
 @pytest.mark.parametrize("which", MODELS)
-def test_a_gap_of_two_geoms_alone_is_none_either(tmp_path, which):
-    """MuJoCo may be told of a gap for one pair of geoms: 2 mm above the pad nothing is in contact."""
+def test_the_gap_of_a_pair_of_geoms_is_no_contact(tmp_path, which):
+    """MuJoCo allows a gap for one pair of geoms: 2 mm above the pad nothing is in contact."""
     extra = '<contact><pair geom1="pad" geom2="item" gap=".005"/></contact>'
     sensors = {"depth": {"kind": "contact_depth", "feels": ["item"]}}
     touch = compiled(tmp_path, GAPPED.format(z=".032", more=""), {"item": {"body": "item"}}, sensors, extra=extra)
@@ -175,8 +172,8 @@ def test_a_margin_is_a_contact(tmp_path, which):
     assert state.contact_found == 4 and state.contact_netforce[0, 0, 2] < -0.1
 
 
-def test_contacts_of_different_margins_are_told_apart(tmp_path):
-    """A ball in its margin of 6 mm, further off than a box in its gap: MuJoCo's own contacts say which is one."""
+def test_contacts_of_different_margins_are_distinguished(tmp_path):
+    """A ball within its margin, further away than a box within its gap: MuJoCo's `exclude` is the oracle."""
     more = '<geom name="ball" pos=".03 0 .002" size=".01" mass="0" margin=".015"/>'
     body = GAPPED.format(z=".0312", more='gap=".005"').replace("</body>", f"{more}</body>")
     touch = compiled(tmp_path, body, {"item": {"body": "item"}}, of_kinds(["item"]))
@@ -191,14 +188,14 @@ def test_contacts_of_different_margins_are_told_apart(tmp_path):
     assert warp(touch.float(), 1).state().contact_found == 1
 
 
-def test_a_sensor_that_does_not_say_how_far_is_refused(tmp_path):
+def test_a_contact_sensor_without_distances_is_refused(tmp_path):
     touch = compiled(tmp_path, GAPPED.format(z=".032", more='gap=".005"'), {"item": {"body": "item"}}, of_kinds(["item"]))
     text = touch.plan.scene.mjcf.replace("torque dist pos", "torque pos")
     with pytest.raises(SimulationError, match='the contact sensor "tgdsl/contact/pad/item" does not show dist; add them with'):
         BatchSimulation(touch, 1, model=mujoco.MjModel.from_xml_string(text))
 
 
-# Bodies welded of bodies
+# Welded bodies
 
 
 @pytest.mark.slow
@@ -207,8 +204,8 @@ def test_a_sensor_that_does_not_say_how_far_is_refused(tmp_path):
     [("mujoco", 'name="handle"'), ("mujoco", ""), ("warp", "")],
     ids=["mujoco-named", "mujoco-unnamed", "warp-unnamed"],
 )
-def test_what_is_welded_to_an_objects_body_is_part_of_it(tmp_path, which, name):
-    """A mug that stands on its handle, a body without joint: depth, distance, contacts and force are those of the handle."""
+def test_a_body_welded_to_an_object_is_part_of_it(tmp_path, which, name):
+    """A mug stands on its handle, a child without a joint: depth, distance, contacts and force belong to the handle."""
     sensors = {
         **of_kinds(["mug"]),
         "depth": {"kind": "contact_depth", "feels": ["mug"]},
@@ -230,8 +227,8 @@ def test_what_is_welded_to_an_objects_body_is_part_of_it(tmp_path, which, name):
     assert ((readings["depth"][0, :, 0] > 0) == (outside + inside < 0.004)).all()
 
 
-def test_a_stage_with_fixed_joints_is_welded_as_well(tmp_path):
-    """The same mug as USD, where the handle is a rigid body on a fixed joint: it stands on the pad with its weight."""
+def test_fixed_joints_of_a_stage_weld_an_object(tmp_path):
+    """The same mug in USD, with the handle as a rigid body on a fixed joint: it presses with its weight."""
     text = MUG.format(z=40, name='name="handle"')
     touch = compiled(tmp_path, text, {"mug": {"body": "mug"}}, of_kinds(["mug"]), as_usd=True)
     assert touch.inputs.contacts_of == {"mug": (ContactPart("subtree", "mug"),)}
@@ -240,30 +237,30 @@ def test_a_stage_with_fixed_joints_is_welded_as_well(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("which", MODELS)
-def test_a_welded_body_that_is_an_object_is_that_object(tmp_path, which):
+def test_a_welded_body_may_be_an_object_itself(tmp_path, which):
     objects = {"mug": {"body": "mug"}, "handle": {"body": "handle"}}
     sensors = {f"{kind}_{name}": sensor for name in objects for kind, sensor in of_kinds([name]).items()}
     sensors |= {f"{kind}_both": sensor for kind, sensor in of_kinds(["mug", "handle"]).items()}
     touch = compiled(tmp_path, MUG.format(z=40, name='name="handle"'), objects, sensors)
-    found = pressed(touch, which)
+    loads = pressed(touch, which)
     for kind in of_kinds([]):
-        assert found[f"{kind}_mug"] == 0
-        assert found[f"{kind}_handle"] == found[f"{kind}_both"] == pytest.approx(LOAD, rel=RESTING)
+        assert loads[f"{kind}_mug"] == 0
+        assert loads[f"{kind}_handle"] == loads[f"{kind}_both"] == pytest.approx(LOAD, rel=RESTING)
 
 
-def test_a_surface_may_be_one_of_a_welded_body(tmp_path):
-    """`surface: handle` names a geom of the child; a hinge below ends the object; a third body that is welded has its own."""
+def test_a_surface_may_name_a_geom_of_a_welded_body(tmp_path):
+    """`surface: handle` names a geom of the child; the object ends at a hinge."""
     flap = '<body name="flap" pos="0 0 .02"><joint axis="0 1 0"/><geom name="flap" size=".005" mass=".01"/></body>'
     text = MUG.format(z=40, name='name="handle"')
     objects = {"mug": {"body": "mug"}, "grip": {"body": "mug", "surface": "handle"}}
     touch = compiled(tmp_path, text[: text.rindex("</body>")] + flap + "</body>", objects, of_kinds(["mug", "grip"]))
-    own = {"mug": (ContactPart("body", "mug"), ContactPart("body", "handle")), "grip": (ContactPart("body", "handle"),)}
-    assert touch.inputs.contacts_of == own
+    parts = {"mug": (ContactPart("body", "mug"), ContactPart("body", "handle")), "grip": (ContactPart("body", "handle"),)}
+    assert touch.inputs.contacts_of == parts
     assert pressed(touch, "mujoco") == {name: pytest.approx(0.31 * G, rel=1e-3) for name in of_kinds([])}
 
 
 def test_contacts_of_two_parts_share_the_slots(tmp_path):
-    """A body and its welded child touch with four points each: MuJoCo's own, one part's after the other's, eight or five."""
+    """A body and its welded child have four contacts each: MuJoCo's, part after part, in eight or five slots."""
     text = '<body name="item" pos="0 0 .0199"><freejoint/><geom type="box" size=".01 .01 .01" mass=".1"/>{}</body>'
     child = '<body name="{}" pos="{}">{}<geom type="box" size=".01 .01 .01" mass=".1"/></body>'
     parts = child.format("welded", ".03 0 0", "") + child.format("hinged", "0 .03 0", '<joint axis="0 0 1"/>')
@@ -275,21 +272,21 @@ def test_contacts_of_two_parts_share_the_slots(tmp_path):
         data = mujoco.MjData(sim.model)
         mujoco.mj_forward(sim.model, data)
         names = [{sim.model.body(sim.model.geom_bodyid[g]).name for g in contact.geom} for contact in data.contact]
-        order = [i for part in ("item", "welded") for i, own in enumerate(names) if own == {part, "pad"}]
+        order = [i for part in ("item", "welded") for i, bodies in enumerate(names) if bodies == {part, "pad"}]
         expected = [data.contact[i].pos for i in order]
         assert len(expected) == 8
         state = sim.state()
         assert state.contact_found == 8
         np.testing.assert_allclose(state.contact_pos[0, 0], expected[:num], atol=1e-12)
         wrench, load = np.zeros(6), 0.0
-        for i, own in enumerate(names):
+        for i, bodies in enumerate(names):
             mujoco.mj_contactForce(sim.model, data, i, wrench)
-            load += wrench[0] if "hinged" not in own else 0.0  # its first number is along the normal, which is vertical
+            load += wrench[0] if "hinged" not in bodies else 0.0  # along the normal, which is vertical
         assert float(state.contact_netforce[0, 0, 2]) == pytest.approx(-load, rel=1e-12)
 
 
-def test_a_link_that_is_welded_to_an_object_does_not_feel_itself(tmp_path):
-    """The pad is part of what the table's body is: its probes, inside that, feel nothing of it, and who asks is told."""
+def test_a_link_welded_to_an_object_cannot_feel_it(tmp_path):
+    """The pad is part of the table's rigid body, and its probes lie inside it."""
     (tmp_path / "scene.xml").write_text(
         '<mujoco><worldbody><body name="table"><geom type="box" size=".1 .1 .1"/>'
         '<body name="pad"><geom type="box" size=".01 .01 .01"/></body></body></worldbody></mujoco>'
@@ -307,8 +304,8 @@ def test_a_link_that_is_welded_to_an_object_does_not_feel_itself(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("which", MODELS)
-def test_variants_stand_for_welded_geoms_too(tmp_path, which):
-    """Each variant of the mug rests on its own geom and has its own weight; the handle is gone, and the clip, an object, is not."""
+def test_variants_replace_welded_geoms_too(tmp_path, which):
+    """Each variant of the mug rests with its own weight; the handle is gone, and the clip, another object, stays."""
     clip = '<body name="clip" pos="0 0 .03"><geom name="clip" type="box" size=".002 .002 .002" mass=".05"/></body>'
     text = MUG.format(z=20, name='name="handle"').replace("</body>\n</body>", f"</body>\n{clip}</body>")
     variants = [{"type": "box", "size": [0.02, 0.02, 0.01], "density": d} for d in (3125, 6250)]  # 0.1 and 0.2 kg

@@ -1,4 +1,4 @@
-"""MuJoCo's options by name: the physics is that of a scene with these in its XML, on both simulators and in every variant."""
+"""MuJoCo's options by name act like the same options in the scene's XML, on both simulators and in every variant."""
 
 import mujoco
 import numpy as np
@@ -18,41 +18,41 @@ VARIANTS = {"variants": [{"type": "box", "size": [0.02] * 3}, {"type": "sphere",
 
 @BOTH
 @pytest.mark.parametrize("target", [None, VARIANTS], ids=["one", "variants"])
-def test_options_act_as_those_of_the_scene(tmp_path, simulator, target):
-    given = simulator(module(tmp_path, target=target), 3, options=OPTIONS, substeps=2, keyframe="home")
+def test_options_act_like_those_in_the_scene(tmp_path, simulator, target):
+    sim = simulator(module(tmp_path, target=target), 3, options=OPTIONS, substeps=2, keyframe="home")
     text = SCENE.replace('<option timestep="0.002" cone="elliptic" impratio="10" integrator="implicitfast"/>', WRITTEN)
     assert text != SCENE
-    written = simulator(module(tmp_path, text, target=target), 3, substeps=2, keyframe="home")
-    assert given.control_step == written.control_step == 0.008
+    expected = simulator(module(tmp_path, text, target=target), 3, substeps=2, keyframe="home")
+    assert sim.control_step == expected.control_step == 0.008
     for _ in range(5):
-        given.step(np.array([0.1, -0.2]))
-        written.step(np.array([0.1, -0.2]))
-    np.testing.assert_array_equal(given.qpos.numpy(), written.qpos.numpy())
-    assert given.env_model(1).opt.iterations == 7
+        sim.step(np.array([0.1, -0.2]))
+        expected.step(np.array([0.1, -0.2]))
+    np.testing.assert_array_equal(sim.qpos.numpy(), expected.qpos.numpy())
+    assert sim.env_model(1).opt.iterations == 7
 
 
 @BOTH
 @pytest.mark.parametrize("target", [None, VARIANTS], ids=["one", "variants"])
-def test_contacts_are_as_stiff_as_those_of_a_scene_with_the_same_numbers(tmp_path, simulator, target):
-    """Of all geoms, those of variants too; a ball that rests is less deep in where contacts are stiffer."""
+def test_stiffness_options_act_like_those_in_the_scene(tmp_path, simulator, target):
+    """For all geoms, including variants; stiffer contacts change the motion."""
     options = {"solref": [0.01, 0.8], "solimp": [0.95, 0.99, 0.002, 0.4, 3]}
     text = SCENE.replace("<worldbody>", '<default><geom solref=".01 .8" solimp=".95 .99 .002 .4 3"/></default><worldbody>', 1)
     assert text != SCENE
     sims = [
-        simulator(module(tmp_path, scene, target=target), 3, options=given, keyframe="home", substeps=2)
-        for scene, given in ((SCENE, options), (text, None), (SCENE, None))
+        simulator(module(tmp_path, scene, target=target), 3, options=with_options, keyframe="home", substeps=2)
+        for scene, with_options in ((SCENE, options), (text, None), (SCENE, None))
     ]
     for _ in range(20):
         for sim in sims:
             sim.step(np.array([0.1, -0.2]))
-    given, written, before = (sim.qpos.numpy() for sim in sims)
-    np.testing.assert_array_equal(given, written)
-    assert not np.array_equal(given, before)
+    with_options, in_scene, without = (sim.qpos.numpy() for sim in sims)
+    np.testing.assert_array_equal(with_options, in_scene)
+    assert not np.array_equal(with_options, without)
     for model in (sims[0].env_model(1), sims[0].env_model(2)):
         assert (model.geom_solref == [0.01, 0.8]).all() and (model.geom_solimp == options["solimp"]).all()
 
 
-def test_pairs_are_as_stiff_too():
+def test_stiffness_options_apply_to_pairs():
     spec = mujoco.MjSpec.from_string(
         '<mujoco><worldbody><geom name="a" size="1"/><body><joint/><geom name="b" size="1"/></body></worldbody>'
         '<contact><pair geom1="a" geom2="b"/></contact></mujoco>'
@@ -62,8 +62,8 @@ def test_pairs_are_as_stiff_too():
     assert (model.pair_solref == [-100, -1]).all() and (model.geom_solref == [-100, -1]).all()
 
 
-def test_a_time_constant_that_mujoco_would_raise_is_refused_unless_the_scene_has_it_so():
-    """MuJoCo takes two timesteps in place of less, unless `refsafe` is off."""
+def test_a_time_constant_below_two_timesteps_is_refused_unless_refsafe_is_off():
+    """MuJoCo would raise it to two timesteps."""
     spec = mujoco.MjSpec()
     with pytest.raises(SimulationError, match=r"option solref is \[0.009, 1\], expected a time constant of at least 0.01 s"):
         set_options(spec, {"timestep": 0.005, "solref": [0.009, 1]})
@@ -74,7 +74,7 @@ def test_a_time_constant_that_mujoco_would_raise_is_refused_unless_the_scene_has
 
 
 @pytest.mark.parametrize("given", ["elliptic", "Elliptic", int(mujoco.mjtCone.mjCONE_ELLIPTIC)])
-def test_a_keyword_may_be_its_number(given):
+def test_a_keyword_may_be_given_as_its_number(given):
     spec = mujoco.MjSpec()
     set_options(spec, {"cone": given})
     assert spec.option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -109,14 +109,14 @@ def test_an_artefact_keeps_its_own_options(tmp_path):
         ),
     ],
 )
-def test_options_that_cannot_be_are_named(tmp_path, simulator, options, message):
+def test_invalid_options_are_named(tmp_path, simulator, options, message):
     with pytest.raises(SimulationError) as caught:
         simulator(module(tmp_path), 1, options=options)
     assert str(caught.value) == message
 
 
 @BOTH
-def test_a_model_of_ones_own_has_its_own_options(tmp_path, simulator):
+def test_options_are_refused_with_a_users_model(tmp_path, simulator):
     touch = module(tmp_path)
     model = tgdsl.simulate(touch, 1).model
     with pytest.raises(SimulationError, match="`options` are for the artefact's scene"):
@@ -130,7 +130,7 @@ def test_an_unknown_option_is_named(tmp_path):
             simulate(touch, 1, subtseps=2)
 
 
-def test_the_largest_torques_are_those_of_the_last_pattern_that_matches():
+def test_the_last_matching_pattern_sets_the_largest_torque():
     spec = mujoco.MjSpec.from_string(
         "<mujoco><worldbody>"
         + "".join(f"<body name='{n}'><joint name='{n}'/><geom size='.1' mass='1'/></body>" for n in ("left", "right", "lift"))

@@ -1,4 +1,4 @@
-"""Masses and frictions of objects: what MuJoCo derives of them is what it compiles for them, and the physics is theirs."""
+"""Masses and frictions of objects: derived fields match what MuJoCo compiles, and the physics follows."""
 
 import mujoco
 import numpy as np
@@ -34,24 +34,24 @@ BOTH = pytest.mark.parametrize("kind", ["batch", "warp"])
 
 
 def compiled_with(mass: float) -> mujoco.MjModel:
-    """Return the scene as MuJoCo compiles it for a mass in the text."""
+    """Return the scene compiled with a mass."""
     return mujoco.MjModel.from_xml_string(SCENE.replace('mass=".25"', f'mass="{mass}"'))
 
 
 @BOTH
-def test_what_follows_of_a_mass_is_what_mujoco_compiles(tmp_path, kind):
+def test_fields_derived_from_a_mass_match_mujocos_compiler(tmp_path, kind):
     sim = simulator(kind, module(tmp_path), 3)
     sim.properties.set([0, 2], mass={"cube": np.array([0.1, 9, 0.7])})
     np.testing.assert_allclose(sim.properties.mass("cube"), [0.1, 0.25, 0.7], rtol=1e-6)
     for env, mass in enumerate([0.1, 0.25, 0.7]):
         expected = compiled_with(mass)
         for name in MASS_FIELDS:
-            found = sim.parameters[name][env].numpy() if kind == "warp" else getattr(sim.env_model(env), name)
-            np.testing.assert_allclose(found, getattr(expected, name), rtol=1e-5, atol=1e-9, err_msg=f"{name} {env}")
+            values = sim.parameters[name][env].numpy() if kind == "warp" else getattr(sim.env_model(env), name)
+            np.testing.assert_allclose(values, getattr(expected, name), rtol=1e-5, atol=1e-9, err_msg=f"{name} {env}")
 
 
 @BOTH
-def test_environments_move_as_scenes_of_their_mass(tmp_path, kind):
+def test_environments_move_like_scenes_with_their_mass(tmp_path, kind):
     sim, masses = simulator(kind, module(tmp_path), 3, keyframe="home"), [0.1, 0.25, 0.7]
     sim.properties.set(mass={"cube": torch.tensor(masses)})
     push = torch.zeros_like(sim._arrays["xfrc_applied"])
@@ -72,7 +72,7 @@ def test_environments_move_as_scenes_of_their_mass(tmp_path, kind):
 
 @pytest.mark.parametrize(("kind", "friction"), [("batch", 0.3), ("batch", 0.6), ("warp", 0.6)])
 def test_a_cube_slides_beyond_the_angle_of_friction(tmp_path, kind, friction):
-    """On slopes of 0.9 and 1.1 times atan μ: it stays on the one, and gains speed at g (sin α − μ cos α) on the other.
+    """Slopes of 0.9 and 1.1 times atan μ: the cube stays on the first, and accelerates at g (sin α − μ cos α) on the second.
 
     MuJoCo's soft contacts let it hop at first, which costs up to 6 % of the speed.
     """
@@ -89,7 +89,7 @@ def test_a_cube_slides_beyond_the_angle_of_friction(tmp_path, kind, friction):
         assert float(sim.qvel[1, 0]) == pytest.approx(0, abs=0.003)
 
 
-def test_compounds_too_weigh_what_they_are_given(tmp_path):
+def test_compounds_take_a_mass_and_a_friction(tmp_path):
     sim = BatchSimulation(module(tmp_path, target={"variants": [*VARIANTS["variants"], ODD]}), 6)
     before = sim.properties.mass("cube").clone()
     sim.properties.set([1, 2], mass={"cube": 0.5}, friction={"cube": 0.1})
@@ -97,10 +97,12 @@ def test_compounds_too_weigh_what_they_are_given(tmp_path):
     np.testing.assert_allclose(sim.properties.friction("cube"), [1, 0.1, 0.1, 1, 1, 1])
     body = sim.model.body("cube").id
     for env in (1, 2):
-        plain, own = sim.env_model(env + 3), sim.env_model(env)
-        np.testing.assert_allclose(own.body_inertia[body] / 0.5, plain.body_inertia[body] / plain.body_mass[body], rtol=1e-12)
+        plain, changed = sim.env_model(env + 3), sim.env_model(env)
         np.testing.assert_allclose(
-            own.body_invweight0[body] * 0.5, plain.body_invweight0[body] * plain.body_mass[body], rtol=1e-9
+            changed.body_inertia[body] / 0.5, plain.body_inertia[body] / plain.body_mass[body], rtol=1e-12
+        )
+        np.testing.assert_allclose(
+            changed.body_invweight0[body] * 0.5, plain.body_invweight0[body] * plain.body_mass[body], rtol=1e-9
         )
     for _ in range(3):
         sim.step()
@@ -108,7 +110,7 @@ def test_compounds_too_weigh_what_they_are_given(tmp_path):
 
 
 @BOTH
-def test_variants_weigh_what_they_are_given_and_are_themselves_again_when_chosen_anew(tmp_path, kind):
+def test_variants_take_a_mass_and_get_their_own_back_when_chosen_again(tmp_path, kind):
     sim = simulator(kind, module(tmp_path, target=VARIANTS), 4)
     nominal = [1000 * 0.04**3, 500 * 4 / 3 * np.pi * 0.02**3] * 2
     np.testing.assert_allclose(sim.properties.mass("cube"), nominal, rtol=1e-6)
@@ -134,7 +136,7 @@ def test_variants_weigh_what_they_are_given_and_are_themselves_again_when_chosen
         ({"mass": {"cube": 1.0}, "friction": {"cube": -1.0}}, "friction of cube is -1, expected at least 0"),
     ],
 )
-def test_what_cannot_be_is_named_and_changes_nothing(tmp_path, kind, given, message):
+def test_invalid_properties_are_named_and_change_nothing(tmp_path, kind, given, message):
     sim = simulator(kind, module(tmp_path), 3)
     with pytest.raises(SimulationError) as caught:
         sim.properties.set(**given)
@@ -142,7 +144,7 @@ def test_what_cannot_be_is_named_and_changes_nothing(tmp_path, kind, given, mess
     np.testing.assert_allclose(sim.properties.mass("cube"), [0.25] * 3, rtol=1e-6)
 
 
-def test_what_a_gpu_cannot_scale_or_has_not_of_its_own_is_named(tmp_path):
+def test_warp_names_bodies_it_cannot_scale_and_fields_that_environments_share(tmp_path):
     sim = warp(module(tmp_path), 2, per_env=OWN)
     with pytest.raises(SimulationError, match='"pad" is part of a kinematic tree, or its joints have armature'):
         sim.properties.set(mass={"pad": 1.0})
@@ -151,20 +153,20 @@ def test_what_a_gpu_cannot_scale_or_has_not_of_its_own_is_named(tmp_path):
         plain.properties.set(friction={"cube": 1.0})
 
 
-def test_what_all_environments_share_can_be_read(tmp_path):
-    plain, own = warp(module(tmp_path), 2), warp(module(tmp_path), 2, per_env=OWN)
-    for what in ("mass", "friction"):
-        shared, each = (getattr(sim.properties, what)("cube") for sim in (plain, own))
-        assert shared.shape == (2,) and torch.equal(shared, each)
+def test_shared_properties_can_be_read(tmp_path):
+    plain, per_env = warp(module(tmp_path), 2), warp(module(tmp_path), 2, per_env=OWN)
+    for name in ("mass", "friction"):
+        shared, values = (getattr(sim.properties, name)("cube") for sim in (plain, per_env))
+        assert shared.shape == (2,) and torch.equal(shared, values)
 
 
-def test_a_link_of_a_chain_weighs_what_it_is_given_on_the_cpu(tmp_path):
+def test_a_link_of_a_chain_takes_a_mass_on_the_cpu(tmp_path):
     sim = BatchSimulation(module(tmp_path), 2)
-    own = float(sim.properties.mass("pad")[0])
-    sim.properties.set([1], mass={"pad": 2 * own})
+    mass = float(sim.properties.mass("pad")[0])
+    sim.properties.set([1], mass={"pad": 2 * mass})
     model = mujoco.MjModel.from_xml_string(SCENE)
     pad = model.body("pad").id
-    model.body_mass[pad], model.body_inertia[pad] = 2 * own, 2 * model.body_inertia[pad]
+    model.body_mass[pad], model.body_inertia[pad] = 2 * mass, 2 * model.body_inertia[pad]
     mujoco.mj_setConst(model, mujoco.MjData(model))
     for name in (*MASS_FIELDS, "actuator_acc0"):
         np.testing.assert_array_equal(getattr(sim.env_model(1), name), getattr(model, name), err_msg=name)

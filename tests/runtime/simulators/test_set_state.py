@@ -1,4 +1,4 @@
-"""States that users set: on both simulators against a fresh `MjData` that is given the same, and against who was not set."""
+"""Setting states, on both simulators: against a fresh `MjData` with the same values, and with the other environments unchanged."""
 
 import mujoco
 import numpy as np
@@ -17,20 +17,20 @@ BOTH = pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch
 PRESSED = {"kind": "contact", "threshold": 1e-3, "release_threshold": 5e-4}
 
 
-def drawn(model, num: int, seed: int = 0) -> dict[str, np.ndarray]:
-    """Return states in which the cube lies in the table, turned about the vertical, and everything moves."""
+def random_states(model, num: int, seed: int = 0) -> dict[str, np.ndarray]:
+    """Return states in which the cube penetrates the table, turned about the vertical, and everything moves."""
     rng = np.random.default_rng(seed)
-    turn = rng.uniform(-3, 3, size=num)
+    angle = rng.uniform(-3, 3, size=num)
     qpos = np.tile(model.qpos0, (num, 1))
     qpos[:, :3] += rng.uniform([-0.01, -0.01, -5e-4], [0.01, 0.01, 0], size=(num, 3))
-    qpos[:, 3:7] = np.stack([np.cos(turn / 2), 0 * turn, 0 * turn, np.sin(turn / 2)], axis=1)
+    qpos[:, 3:7] = np.stack([np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)], axis=1)
     qpos[:, 7:] = rng.uniform(-0.5, 0.5, size=(num, 2))
     qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
     qvel = rng.normal(size=(num, model.nv)) * [0.2, 0.2, 0.01, 0.1, 0.1, 1, 3, 3]
     return {"qpos": qpos, "qvel": qvel, "ctrl": rng.normal(size=(num, model.nu))}
 
 
-def fresh(model, values: dict[str, np.ndarray], keyframe: int = -1) -> mujoco.MjData:
+def fresh_data(model, values: dict[str, np.ndarray], keyframe: int = -1) -> mujoco.MjData:
     data = mujoco.MjData(model)
     if keyframe >= 0:
         mujoco.mj_resetDataKeyframe(model, data, keyframe)
@@ -40,24 +40,24 @@ def fresh(model, values: dict[str, np.ndarray], keyframe: int = -1) -> mujoco.Mj
     return data
 
 
-def everything(sim) -> dict[str, np.ndarray]:
+def all_arrays(sim) -> dict[str, np.ndarray]:
     if isinstance(sim, BatchSimulation):
         return {name: np.array(getattr(sim.batch, name)) for name in (*INTEGRATED, *DERIVED)}
     sim.state()
-    # Counts of rows and contacts are of the last evaluation, whosever it was.
+    # Counts of rows and contacts belong to the last evaluation, of whichever environments.
     return {n: a.numpy().copy() for n, a in sim.arrays.items() if len(a) == sim.num_envs and n != "nefc"}
 
 
-def as_given(simulator, values, ids, num_envs):
-    """Return the same values in every form: rows of indices, rows of a mask as arrays and as tensors, in any float dtype."""
+def equivalent_arguments(simulator, values, ids, num_envs):
+    """Return the same choice and values by indices, by reversed indices, and by a mask, as arrays and as tensors."""
     rows = {name: np.full((num_envs, value.shape[1]), np.nan) for name, value in values.items()}
     for name, value in values.items():
         rows[name][ids] = value
     mask = np.isin(np.arange(num_envs), ids)
-    turned = {name: torch.from_numpy(value).flip(0) for name, value in values.items()}
+    flipped = {name: torch.from_numpy(value).flip(0) for name, value in values.items()}
     return [
         (ids, values),
-        (ids[::-1], turned),
+        (ids[::-1], flipped),
         (mask, rows),
         (torch.from_numpy(mask), {name: torch.from_numpy(value).requires_grad_() for name, value in rows.items()}),
     ]
@@ -67,22 +67,22 @@ def as_given(simulator, values, ids, num_envs):
 
 
 @pytest.mark.parametrize("form", range(4))
-def test_a_reset_with_values_is_a_fresh_mjdata_and_goes_on_as_one(tmp_path, form):
+def test_reset_with_values_matches_a_fresh_mjdata_then_and_in_later_steps(tmp_path, form):
     touch, model = wanting_contacts(tmp_path)
     sim = BatchSimulation(touch, 5, model=model, keyframe="home")
     for name in DERIVED:
         sim.batch.bind(name)
     for _ in range(7):
         sim.step(np.array([0.2, -0.3]))
-    before, ids = everything(sim), [1, 3]
-    values = drawn(model, 2)
-    chosen, given = as_given(BatchSimulation, values, ids, 5)[form]
-    sim.reset(chosen, **given)
-    after, singles = everything(sim), [fresh(model, {n: v[i] for n, v in values.items()}, 0) for i in range(2)]
-    for name, found in after.items():
-        np.testing.assert_array_equal(found[[0, 2, 4]], before[name][[0, 2, 4]], err_msg=name)
+    before, ids = all_arrays(sim), [1, 3]
+    values = random_states(model, 2)
+    chosen, arguments = equivalent_arguments(BatchSimulation, values, ids, 5)[form]
+    sim.reset(chosen, **arguments)
+    after, singles = all_arrays(sim), [fresh_data(model, {n: v[i] for n, v in values.items()}, 0) for i in range(2)]
+    for name, array in after.items():
+        np.testing.assert_array_equal(array[[0, 2, 4]], before[name][[0, 2, 4]], err_msg=name)
         for env, data in zip(ids, singles, strict=True):
-            np.testing.assert_array_equal(found[env], getattr(data, name), err_msg=name)
+            np.testing.assert_array_equal(array[env], getattr(data, name), err_msg=name)
     assert all(data.ncon == 4 for data in singles) and np.abs(after["qacc"][ids]).max() > 1
     state, cube = sim.state(), touch.inputs.bodies.index("cube")
     np.testing.assert_array_equal(state.body_pos[ids, cube].numpy(), [data.body("cube").xpos for data in singles])
@@ -97,30 +97,30 @@ def test_a_reset_with_values_is_a_fresh_mjdata_and_goes_on_as_one(tmp_path, form
                 np.testing.assert_array_equal(getattr(sim.batch, name)[env], getattr(data, name), err_msg=name)
 
 
-def test_set_state_is_an_assignment_and_mj_forward(tmp_path):
-    """Time, warm start and what is not given stay as in an `MjData` that is stepped, assigned to and evaluated."""
+def test_set_state_equals_assignment_and_mj_forward(tmp_path):
+    """Time, warm start and arrays that are not passed stay as in an `MjData` that is stepped, assigned to and evaluated."""
     touch, model = wanting_contacts(tmp_path)
-    sim, data = BatchSimulation(touch, 3, model=model, keyframe="home"), fresh(model, {}, 0)
+    sim, data = BatchSimulation(touch, 3, model=model, keyframe="home"), fresh_data(model, {}, 0)
     for name in DERIVED:
         sim.batch.bind(name)
     for _ in range(5):
         sim.step()
         mujoco.mj_step(model, data)
-    before, values = everything(sim), {name: value[0] for name, value in drawn(model, 1).items()}
+    before, values = all_arrays(sim), {name: value[0] for name, value in random_states(model, 1).items()}
     sim.set_state([1], qpos=values["qpos"], qvel=values["qvel"])
     data.qpos[:], data.qvel[:] = values["qpos"], values["qvel"]
     mujoco.mj_forward(model, data)
     assert np.abs(data.qacc_warmstart).max() > 1 and data.time > 0
     for _ in range(10):
-        for name, found in everything(sim).items():
-            np.testing.assert_array_equal(found[1], getattr(data, name), err_msg=name)
+        for name, array in all_arrays(sim).items():
+            np.testing.assert_array_equal(array[1], getattr(data, name), err_msg=name)
             if _ == 0:
-                np.testing.assert_array_equal(found[[0, 2]], before[name][[0, 2]], err_msg=name)
+                np.testing.assert_array_equal(array[[0, 2]], before[name][[0, 2]], err_msg=name)
         sim.step()
         mujoco.mj_step(model, data)
 
 
-def test_an_environment_is_copied_by_its_whole_state(tmp_path):
+def test_the_integrated_state_copies_an_environment(tmp_path):
     touch, model = wanting_contacts(tmp_path)
     sim = BatchSimulation(touch, 2, model=model, keyframe="home")
     for i in range(10):
@@ -132,7 +132,7 @@ def test_an_environment_is_copied_by_its_whole_state(tmp_path):
 
 
 @BOTH
-def test_quaternions_are_of_unit_length_by_mujocos_rule(tmp_path, simulator):
+def test_quaternions_are_normalised_by_mujocos_rule(tmp_path, simulator):
     touch = module(tmp_path)
     sim, long = simulator(touch, 3, keyframe="home"), np.array([0.6, -1.2, 0.3, 2.0])
     qpos = np.tile(sim.model.qpos0, (3, 1))
@@ -145,28 +145,28 @@ def test_quaternions_are_of_unit_length_by_mujocos_rule(tmp_path, simulator):
     np.testing.assert_allclose(sim.state().body_quat[:, touch.inputs.bodies.index("cube")], sim.qpos[:, 3:7], atol=4 * eps)
     sim.set_state(qpos=sim.qpos)
     unit = sim.qpos.clone()
-    sim.set_state(qpos=unit)  # what is of unit length stays as it is, bit for bit
+    sim.set_state(qpos=unit)  # unit quaternions stay bit-identical
     assert torch.equal(sim.qpos, unit)
 
 
 @BOTH
-def test_bodies_that_are_led_by_hand(tmp_path, simulator):
-    """A mocap body, and a ball joint: their quaternions are of unit length too, and zero ones are refused."""
-    led = (
+def test_quaternions_of_mocap_bodies_and_ball_joints_are_normalised(tmp_path, simulator):
+    """Quaternions of length zero are refused."""
+    bodies = (
         '<body name="led" mocap="true" pos="1 0 0"><geom size=".01"/></body>'
         '<body name="ball" pos="-1 0 0"><joint type="ball"/><geom size=".01"/></body></worldbody>'
     )
     text = SCENE[: SCENE.index("<keyframe>")] + "</mujoco>"
-    sim = simulator(module(tmp_path, text.replace("</worldbody>", led)), 2)
-    turn = np.array([0.0, 3.0, 0.0, -4.0])
+    sim = simulator(module(tmp_path, text.replace("</worldbody>", bodies)), 2)
+    quaternion = np.array([0.0, 3.0, 0.0, -4.0])
     qpos = sim.model.qpos0.copy()
-    qpos[sim.joints["ball"].qpos] = turn
-    sim.set_state([1], mocap_pos=[[0, 2, 0]], mocap_quat=turn[None], qpos=qpos)
+    qpos[sim.joints["ball"].qpos] = quaternion
+    sim.set_state([1], mocap_pos=[[0, 2, 0]], mocap_quat=quaternion[None], qpos=qpos)
     pos, quat = sim.body_poses(1)
     np.testing.assert_allclose(pos[sim.model.body("led").id], [0, 2, 0], atol=1e-7)
     for name in ("led", "ball"):
-        np.testing.assert_allclose(quat[sim.model.body(name).id], turn / 5, atol=1e-7)
-    np.testing.assert_allclose(sim.qpos[1, sim.joints["ball"].qpos], turn / 5, atol=1e-7)
+        np.testing.assert_allclose(quat[sim.model.body(name).id], quaternion / 5, atol=1e-7)
+    np.testing.assert_allclose(sim.qpos[1, sim.joints["ball"].qpos], quaternion / 5, atol=1e-7)
     np.testing.assert_allclose(sim.body_poses(0)[0][sim.model.body("led").id], [1, 0, 0])
     qpos[sim.joints["ball"].qpos] = 0
     for name, zero in (("mocap_quat", np.zeros((1, 4))), ("qpos", qpos)):
@@ -178,31 +178,31 @@ def test_bodies_that_are_led_by_hand(tmp_path, simulator):
 
 
 @pytest.mark.parametrize("form", range(4))
-def test_on_warp_the_chosen_are_set_and_nothing_of_the_others_changes(tmp_path, form):
+def test_warp_sets_the_chosen_environments_and_leaves_the_others(tmp_path, form):
     touch, model = wanting_contacts(tmp_path)
     sim, twin = (warp(touch, 5, model=model, keyframe="home") for _ in range(2))
     cpu = BatchSimulation(touch, 5, model=model, keyframe="home")
-    for one in (sim, twin, cpu):
-        one.warp_model.opt.tolerance.fill_(model.opt.tolerance) if one is not cpu else None
+    for each in (sim, twin, cpu):
+        each.warp_model.opt.tolerance.fill_(model.opt.tolerance) if each is not cpu else None
         for _ in range(4):
-            one.step(np.array([0.2, -0.3]))
-        one.ctrl[...] = 0.7  # of now: the forces are still those of the last step
-    before, ids = everything(sim), [1, 3]
-    values = {name: value.astype(np.float32).astype(np.float64) for name, value in drawn(model, 2).items()}
-    chosen, given = as_given(warp, values, ids, 5)[form]
-    sim.reset(chosen, **given)
+            each.step(np.array([0.2, -0.3]))
+        each.ctrl[...] = 0.7  # set now: the forces still come from the last step
+    before, ids = all_arrays(sim), [1, 3]
+    values = {name: value.astype(np.float32).astype(np.float64) for name, value in random_states(model, 2).items()}
+    chosen, arguments = equivalent_arguments(warp, values, ids, 5)[form]
+    sim.reset(chosen, **arguments)
     cpu.reset(ids, **values)
-    after = everything(sim)
+    after = all_arrays(sim)
     assert {"geom_xpos", "qfrc_actuator", "qacc_warmstart", "time", "cvel", "sensordata"} <= set(after)
-    for name, found in after.items():
-        np.testing.assert_array_equal(found[[0, 2, 4]], before[name][[0, 2, 4]], err_msg=name)
+    for name, array in after.items():
+        np.testing.assert_array_equal(array[[0, 2, 4]], before[name][[0, 2, 4]], err_msg=name)
     state, other = sim.state(), cpu.state()
     rows = {name: (getattr(state, name)[ids], getattr(other, name)[ids]) for name in touch.inputs.fields}
     assert_agree(*(tgdsl.SceneState(**{name: pair[i] for name, pair in rows.items()}) for i in range(2)), touch.inputs.fields)
     assert (sim.arrays["time"][ids] == 0).all() and (sim.arrays["qacc_warmstart"][ids] == 0).all()
     for _ in range(5):
-        for one in (sim, twin, cpu):
-            one.step(np.array([0.1, 0.1]))
+        for each in (sim, twin, cpu):
+            each.step(np.array([0.1, 0.1]))
     for name in ("qpos", "qvel", "xpos", "time"):
         assert torch.equal(sim.arrays[name][[0, 2, 4]], twin.arrays[name][[0, 2, 4]]), name
     np.testing.assert_allclose(sim.qpos[ids], cpu.qpos[ids], atol=TOLERANCE)
@@ -210,7 +210,7 @@ def test_on_warp_the_chosen_are_set_and_nothing_of_the_others_changes(tmp_path, 
 
 
 @BOTH
-def test_reset_begins_an_episode_and_set_state_does_not(tmp_path, simulator):
+def test_reset_starts_an_episode_and_set_state_does_not(tmp_path, simulator):
     text = SCENE.replace('pos="0 0 .0299"', 'pos="0 0 .028"')
     touch = module(tmp_path, text, links=("table",), **PRESSED)
     sim = simulator(touch, 3)
@@ -228,7 +228,7 @@ def test_reset_begins_an_episode_and_set_state_does_not(tmp_path, simulator):
 
 
 @BOTH
-def test_what_was_written_into_the_live_tensors_is_evaluated_on_demand(tmp_path, simulator):
+def test_forward_evaluates_values_written_into_live_tensors(tmp_path, simulator):
     touch = module(tmp_path)
     sim = simulator(touch, 3, keyframe="home")
     assert (sim.qpos.shape, sim.qvel.shape, sim.ctrl.shape) == ((3, 9), (3, 8), (3, 2))
@@ -251,8 +251,8 @@ def test_what_was_written_into_the_live_tensors_is_evaluated_on_demand(tmp_path,
 @BOTH
 def test_joints_by_name(tmp_path, simulator):
     sim = simulator(module(tmp_path), 2)
-    assert sim.joint_names == ("cube", "one", "two")  # the free joint has no name but that of its body
-    assert [(own.qpos, own.qvel) for own in sim.joints.values()] == [
+    assert sim.joint_names == ("cube", "one", "two")  # the free joint takes the name of its body
+    assert [(joint.qpos, joint.qvel) for joint in sim.joints.values()] == [
         (slice(0, 7), slice(0, 6)),
         (slice(7, 8), slice(6, 7)),
         (slice(8, 9), slice(7, 8)),
@@ -295,32 +295,32 @@ WRONG = [
 
 
 @BOTH
-def test_what_cannot_be_set_is_refused_by_name_and_changes_nothing(tmp_path, simulator):
+def test_invalid_values_are_refused_and_change_nothing(tmp_path, simulator):
     sim = simulator(module(tmp_path), 3, keyframe="home")
     sim.step()
-    before = everything(sim)
+    before = all_arrays(sim)
     for values, ids, message in WRONG:
         for call in (sim.reset, sim.set_state):
             with pytest.raises(SimulationError, match=message):
                 call(ids, **{"ctrl": np.ones(2), **values})
-    after = everything(sim)
+    after = all_arrays(sim)
     assert all(np.array_equal(after[name], before[name]) for name in before)
     is_chosen = torch.tensor([True, False, True])
-    sim.set_state(is_chosen, qvel=torch.full((3, 8), torch.nan).index_fill(0, torch.tensor([0, 2]), 0.25))  # row 1 is not taken
+    sim.set_state(is_chosen, qvel=torch.full((3, 8), torch.nan).index_fill(0, torch.tensor([0, 2]), 0.25))  # row 1 is ignored
     torch.testing.assert_close(sim.qvel[is_chosen], torch.full((2, 8), 0.25, dtype=sim.qvel.dtype))
     sim.set_state([], qpos=np.zeros((0, 9)))
 
 
 @BOTH
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.int32])
-def test_numbers_of_any_dtype(tmp_path, simulator, dtype):
+def test_values_may_have_any_dtype(tmp_path, simulator, dtype):
     sim = simulator(module(tmp_path), 2)
     sim.set_state([1], qvel=torch.arange(8, dtype=dtype), time=torch.tensor([3.0]), ctrl=[1, 2])
     assert sim.qvel[1].tolist() == list(range(8)) and sim.qvel[0].tolist() == [0.0] * 8
     assert sim.ctrl.tolist() == [[0, 0], [1, 2]]
 
 
-def test_float64_that_float32_cannot_hold_is_refused(tmp_path):
+def test_float64_values_beyond_float32_are_refused(tmp_path):
     sim = warp(module(tmp_path), 2)
     with pytest.raises(SimulationError, match=r"^qvel is not finite in environments 0, 1$"):
         sim.set_state(qvel=np.full(8, 1e300))
@@ -329,7 +329,7 @@ def test_float64_that_float32_cannot_hold_is_refused(tmp_path):
 
 
 @BOTH
-def test_under_inference_mode(tmp_path, simulator):
+def test_set_state_and_reset_work_under_inference_mode(tmp_path, simulator):
     touch = module(tmp_path)
     with torch.inference_mode():
         sim = simulator(touch, 2, keyframe="home")
@@ -340,38 +340,38 @@ def test_under_inference_mode(tmp_path, simulator):
     assert torch.isfinite(sim.qpos).all()
 
 
-def test_in_a_graph_of_ones_own_a_reset_is_evaluated_at_once(tmp_path, monkeypatch):
-    """What is captured is replayed without the host, which therefore cannot say later what is to be evaluated.
+def test_reset_in_a_users_graph_is_evaluated_at_once(tmp_path, monkeypatch):
+    """A captured reset is replayed without the host, so evaluation cannot be deferred to a later reading.
 
-    Nor can it later have a captured reading evaluate anything: from then on everything is evaluated at once.
+    After such a capture, every reset is evaluated at once.
     """
     sim, twin = (warp(module(tmp_path), 3, keyframe="home") for _ in range(2))
-    for one in (sim, twin):
-        one.step()
+    for each in (sim, twin):
+        each.step()
     mask, qpos = torch.tensor([True, False, True]), sim.qpos + torch.eye(9)[2]
     assert not sim._stream.is_capturing
     monkeypatch.setattr(WarpStream, "is_capturing", property(lambda self: True))
     monkeypatch.setattr(WarpStream, "capture_scope", WarpStream.scope)
     sim.reset(mask, qpos=qpos)
-    found = {name: sim.arrays[name].clone() for name in ("xpos", "cvel", "geom_xpos")}
+    arrays = {name: sim.arrays[name].clone() for name in ("xpos", "cvel", "geom_xpos")}
     monkeypatch.undo()
     twin.reset(mask, qpos=qpos)
-    assert not torch.equal(twin.arrays["xpos"], found["xpos"])  # there it waits for `state`
+    assert not torch.equal(twin.arrays["xpos"], arrays["xpos"])  # the twin waits for `state`
     twin.state()
-    for name, value in found.items():
+    for name, value in arrays.items():
         assert torch.equal(twin.arrays[name], value), name
-    for one in (sim, twin):
-        one.reset(mask)
+    for each in (sim, twin):
+        each.reset(mask)
     assert not torch.equal(twin.arrays["xpos"], sim.arrays["xpos"])
     assert torch.equal(twin.state().body_pos, sim.state().body_pos) and torch.equal(twin.arrays["xpos"], sim.arrays["xpos"])
 
 
 @BOTH
-def test_a_state_says_when_it_is(tmp_path, simulator):
-    """By MuJoCo's own clock at the instant of its poses: one physics step before now after a step, else now."""
+def test_a_state_carries_its_time(tmp_path, simulator):
+    """`time` is MuJoCo's clock at the instant of the poses: one physics step behind after a step, else now."""
     touch = module(tmp_path)
     sim = simulator(touch, 3, substeps=4, keyframe="home")
-    data = fresh(sim.model, {}, keyframe=0)
+    data = fresh_data(sim.model, {}, keyframe=0)
     assert sim.state().time.tolist() == [0.0] * 3 == sim.time.tolist()
     sim.step(), sim.step()
     for _ in range(7):
@@ -385,7 +385,7 @@ def test_a_state_says_when_it_is(tmp_path, simulator):
     torch.testing.assert_close(state.body_pos[:, cube].double(), pos, rtol=0, atol=1e-6)
     sim.forward([1]), sim.reset([2])
     expected = torch.tensor([instant, data.time, 0.0], dtype=torch.float64)
-    for found in (sim.time, sim.state().time):
-        torch.testing.assert_close(found.double(), expected, rtol=0, atol=1e-8)
-    assert [round(float(own.time[0]), 4) for own in sim.substates()] == [0.016, 0.018, 0.02, 0.022]
+    for time in (sim.time, sim.state().time):
+        torch.testing.assert_close(time.double(), expected, rtol=0, atol=1e-8)
+    assert [round(float(substate.time[0]), 4) for substate in sim.substates()] == [0.016, 0.018, 0.02, 0.022]
     torch.testing.assert_close(state.time.double(), torch.full((3,), instant, dtype=torch.float64), rtol=0, atol=1e-8)

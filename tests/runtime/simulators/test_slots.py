@@ -1,4 +1,4 @@
-"""More contacts than slots: no newton is lost, and whoever reads is told, once; and numbers that are none come out as none."""
+"""More contacts than slots: no force is lost and one warning is given. Not-a-number in a state stays not-a-number in readings."""
 
 import dataclasses
 import warnings
@@ -21,7 +21,7 @@ TEN = '<body name="item" pos="0 0 .02"><freejoint/>{}</body>'.format(
         for y in (-0.01, 0.01)
     )
 )
-"""Ten boxes that are one body of 0.3 kg: 40 contacts, or as many as both simulators find."""
+"""One body of 0.3 kg made of ten boxes: up to 40 contacts."""
 ONE = '<body name="item" pos="0 0 .03"><freejoint/><geom type="box" size=".02 .02 .02" mass=".3"/></body>'
 TWO = ONE + '<body name="other" pos="0 0 .08"><freejoint/><geom type="box" size=".02 .02 .02" mass=".1"/></body>'
 ITEM = {"item": {"body": "item"}}
@@ -34,7 +34,7 @@ def settled(touch, which="mujoco", **options):
 
 
 def test_disabled_sensors_are_refused(tmp_path):
-    """MuJoCo then fills no sensor: contacts would silently be none."""
+    """MuJoCo then fills no sensor, and contacts would silently be missing."""
     touch = compiled(tmp_path, ONE, ITEM, of_kinds(["item"]))
     spec = mujoco.MjSpec.from_file(str(tmp_path / "scene.xml"))
     model = tgdsl.instrument(spec, touch.inputs).compile()
@@ -44,8 +44,8 @@ def test_disabled_sensors_are_refused(tmp_path):
         BatchSimulation(touch, 1, model=model)
 
 
-def test_contacts_that_press_from_both_sides_are_warned_of_too(tmp_path):
-    """Their net force is nothing: what is not shown leaves no trace in it."""
+def test_squeezing_contacts_beyond_the_slots_are_warned_of(tmp_path):
+    """Their net force is zero, so contacts without a slot leave no trace in it."""
     touch = compiled(tmp_path, ONE, ITEM, of_kinds(["item"]))
     _, state = settled(touch)
     squeezed = dataclasses.replace(
@@ -60,13 +60,13 @@ def test_contacts_that_press_from_both_sides_are_warned_of_too(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("which", MODELS)
 def test_more_contacts_than_slots_carry_the_whole_load(tmp_path, which):
-    """Ten boxes: with 8 slots the sum is m g, the balanced taxels press with it, and who reads is told how many slots would do."""
+    """Ten boxes, 8 slots: the sum is m g, balanced taxels carry it, and the warning says how many slots would do."""
     touch = compiled(tmp_path, TEN, ITEM, of_kinds(["item"]))
     sim, state = settled(touch, which)
-    with pytest.warns(UserWarning, match=r"contacts of pad – item are more than `slots: 8`.*`slots: (\d+)` would do") as told:
+    with pytest.warns(UserWarning, match=r"contacts of pad – item are more than `slots: 8`.*`slots: (\d+)` would do") as caught:
         readings = touch(state)
     most = int(state.contact_found.max())
-    assert most > 24 and f"`slots: {most}` would do" in str(told[0].message)
+    assert most > 24 and f"`slots: {most}` would do" in str(caught[0].message)
     shown = float(state.contact_force[0, 0, :, 2].sum())
     assert shown > -0.5 * LOAD
     net = state.contact_netforce[0, 0].to(readings["shared"].dtype)
@@ -87,12 +87,12 @@ def test_more_contacts_than_slots_carry_the_whole_load(tmp_path, which):
     )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = enough(settled(enough, which)[1])
-    torch.testing.assert_close(found["balanced"].norm() / plain.norm(), factor, rtol=1e-3, atol=0)
+        whole = enough(settled(enough, which)[1])
+    torch.testing.assert_close(whole["balanced"].norm() / plain.norm(), factor, rtol=1e-3, atol=0)
 
 
-def made(touch, pos, force, net, found=True):
-    """Return a state of a body 1 mm in the pad, whose contacts are given [m], [N]."""
+def pad_state(touch, pos, force, net, found=True):
+    """Return a state with a body 1 mm deep in the pad and the given contacts [m], [N]."""
     fields = {
         name: torch.zeros(1, 1, touch.inputs.slots, 3, dtype=torch.float64) for name in ("pos", "force", "torque", "normal")
     }
@@ -115,13 +115,13 @@ def made(touch, pos, force, net, found=True):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:contacts of pad")
 @pytest.mark.parametrize("which", ["double", "single"])
-def test_what_is_lacking_acts_at_the_centre_of_what_is_shown(tmp_path, which):
-    """Two contacts of 1 N and 3 N show 4 of 10 N: moment about the pad's origin as of 10 N at (3 x₂ + x₁) / 4, to 1e-5."""
+def test_force_without_slots_acts_at_the_centre_of_the_shown_contacts(tmp_path, which):
+    """Two contacts of 1 N and 3 N show 4 of 10 N: the rest acts at (3 x₂ + x₁) / 4, about the pad's origin, to 1e-5."""
     sensors = {"shared": {"kind": "force_taxel", "feels": ["item"], "slots": 2}}
     touch = compiled(tmp_path, ONE, ITEM, sensors, dtype=torch.float64 if which == "double" else torch.float32)
     pos, force = [[-0.01, 0.004, 0.01], [0.012, -0.008, 0.01]], [[0.0, 0, -1], [0.5, 0, -3]]
     net = [0.5, 1.0, -10.0]
-    readings = touch(made(touch, pos, force, net))
+    readings = touch(pad_state(touch, pos, force, net))
     taxels = readings["shared"][0].double()
     np.testing.assert_allclose(taxels.sum(dim=0), net, atol=1e-5 * 10)
     assert readings["shared/missed"].abs().max() < 1e-5 * 10
@@ -135,54 +135,54 @@ def test_what_is_lacking_acts_at_the_centre_of_what_is_shown(tmp_path, which):
 
 
 @pytest.mark.filterwarnings("ignore:contacts of pad")
-def test_contacts_without_force_share_alike(tmp_path):
-    """A state that says where contacts are but not which force each has: 2 N act at their middle; nowhere at all: they are missed."""
+def test_contacts_without_force_share_the_net_force_equally(tmp_path):
+    """A state with contact positions but no contact forces: 2 N act at their middle. Without positions, they are missed."""
     touch = compiled(tmp_path, ONE, ITEM, {"shared": {"kind": "force_taxel", "feels": ["item"], "slots": 2}})
     pos = [[-0.015, 0.015, 0.01], [0.015, 0.015, 0.01]]
-    taxels = touch(made(touch, pos, np.zeros((2, 3)).tolist(), [0.0, 0, -2]))["shared"][0]
+    taxels = touch(pad_state(touch, pos, np.zeros((2, 3)).tolist(), [0.0, 0, -2]))["shared"][0]
     np.testing.assert_allclose(taxels.sum(dim=0), [0, 0, -2], atol=1e-12)
     left = torch.tensor(touch.taxels["shared"]["pos"][:, 0] < 0)
     assert float(taxels[left, 2].sum()) == pytest.approx(-1, rel=1e-9)
-    readings = touch(made(touch, [], [], [0.0, 0, -2]))
+    readings = touch(pad_state(touch, [], [], [0.0, 0, -2]))
     assert not readings["shared"].any()
     np.testing.assert_array_equal(readings["shared/missed"][0, 0], [0, 0, -2])
 
 
 @pytest.mark.parametrize(("found", "advice"), [(True, "more slots"), (1.0, "more slots"), (11.0, "slots: 11")])
-def test_anyones_own_state_is_looked_at_too(tmp_path, found, advice):
-    """A state of one's own that lacks force in its slots is told of; if it counts more contacts, at once, with the number."""
+def test_states_of_users_are_checked_for_missing_slots(tmp_path, found, advice):
+    """A user's state with too little force in its slots is warned of; if it counts more contacts, the warning has the number."""
     touch = compiled(tmp_path, ONE, ITEM, {"shared": {"kind": "force_taxel", "feels": ["item"], "slots": 1}})
     whole = [0.0, 0, -1.0001] if found == 11.0 else [0.0, 0, -2]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        touch(made(touch, [[0.0, 0, 0.01]], [[0.0, 0, -1]], [0.0, 0, -1.0001], min(found, 1.0)))
+        touch(pad_state(touch, [[0.0, 0, 0.01]], [[0.0, 0, -1]], [0.0, 0, -1.0001], min(found, 1.0)))
     with pytest.warns(UserWarning, match=f"pad – item are more than `slots: 1`.*`{advice}` would do"):
-        touch(made(touch, [[0.0, 0, 0.01]], [[0.0, 0, -1]], whole, found))
+        touch(pad_state(touch, [[0.0, 0, 0.01]], [[0.0, 0, -1]], whole, found))
 
 
-def test_no_environments_lack_nothing(tmp_path):
+def test_zero_environments_give_empty_readings_without_a_warning(tmp_path):
     touch = compiled(tmp_path, ONE, ITEM, of_kinds(["item"]))
     assert all(len(reading) == 0 for reading in touch(touch.example_state(0)).values())
 
 
-def test_each_pair_is_told_of_once(tmp_path):
-    """Two pairs, the second later: two warnings, and then none, also for a module that is compiled."""
+def test_each_pair_is_warned_of_once(tmp_path):
+    """Two pairs, the second later: two warnings, then none."""
     objects = {"item": {"body": "item"}, "other": {"body": "other"}}
     touch = compiled(tmp_path, TWO, objects, {"shared": {"kind": "force_taxel", "feels": ["item", "other"], "slots": 1}})
     state = touch.example_state(3)
-    whole = state.contact_netforce.clone()
+    netforce = state.contact_netforce.clone()
     for name in ("item", "other"):
         pair = [pair.object for pair in touch.inputs.pairs].index(name)
-        whole[1, pair] += 1.0
-        with pytest.warns(UserWarning, match=f"contacts of pad – {name} are more") as told:
-            touch(dataclasses.replace(state, contact_netforce=whole))
-        assert len(told) == 1
+        netforce[1, pair] += 1.0
+        with pytest.warns(UserWarning, match=f"contacts of pad – {name} are more") as caught:
+            touch(dataclasses.replace(state, contact_netforce=netforce))
+        assert len(caught) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        touch(dataclasses.replace(state, contact_netforce=2 * whole))
+        touch(dataclasses.replace(state, contact_netforce=2 * netforce))
 
 
-def test_steps_and_reads_in_one_warn_too(tmp_path):
+def test_step_and_read_warns_too(tmp_path):
     touch = compiled(tmp_path, TEN, ITEM, {"shared": {"kind": "force_taxel", "feels": ["item"]}}, dtype=torch.float32)
     sim = warp(touch, 1, substeps=20)
     with pytest.warns(UserWarning, match="contacts of pad – item are more than `slots: 8`"):
@@ -213,7 +213,7 @@ READ = {
 
 @pytest.fixture(scope="module")
 def three(tmp_path_factory):
-    """A module with sensors of all kinds, and the state of three environments in which a body rests on the pad."""
+    """A module with sensors of all kinds, and a state of three environments with a body at rest on the pad."""
     touch = compiled(tmp_path_factory.mktemp("three"), ONE, ITEM, KINDS)
     state = settled(touch, num_envs=3)[1]
     np.testing.assert_allclose(-state.contact_netforce[:, 0, 2], LOAD, rtol=RESTING)
@@ -221,8 +221,8 @@ def three(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", READ)
-def test_what_is_no_number_is_read_as_none(three, name):
-    """In one environment, in its first contact: none in what depends on it there, and everything else is what it was."""
+def test_not_a_number_in_a_state_gives_not_a_number_in_readings(three, name):
+    """One environment's first contact is not-a-number: only readings there that depend on it change."""
     touch, state = three
     touch.reset()
     before = {key: value.clone() for key, value in touch(state).items()}
@@ -235,14 +235,14 @@ def test_what_is_no_number_is_read_as_none(three, name):
         torch.testing.assert_close(after[key][[0, 2]], before[key][[0, 2]], rtol=0, atol=0)
         if key in READ[name]:
             assert after[key][1].isnan().any(), key
-            felt = before[key][1].abs().sum(dim=-1) > 0
-            assert after[key][1][felt].isnan().any(dim=-1).all(), key
+            is_active = before[key][1].abs().sum(dim=-1) > 0
+            assert after[key][1][is_active].isnan().any(dim=-1).all(), key
         else:
             torch.testing.assert_close(after[key][1], before[key][1], rtol=0, atol=0)
 
 
 def test_a_force_without_a_normal_is_not_hidden(three):
-    """Nobody takes it for none: what needs the normal is not-a-number there, and all else reads what it read."""
+    """Readings that need the normal are not-a-number there; all others are unchanged."""
     touch, state = three
     touch.reset()
     before = {key: value.clone() for key, value in touch(state).items()}
@@ -258,8 +258,8 @@ def test_a_force_without_a_normal_is_not_hidden(three):
             torch.testing.assert_close(after[key][1], before[key][1], rtol=0, atol=0)
 
 
-def test_an_unused_slot_is_nowhere(three):
-    """Where force, torque and normal are zero, the place does not matter, whatever it is."""
+def test_the_position_of_an_unused_slot_is_ignored(three):
+    """A slot is unused where force, torque and normal are zero."""
     touch, state = three
     touch.reset()
     before = touch(state)["shared"].clone()

@@ -1,4 +1,4 @@
-"""Starts without a look for contacts, on both simulators: poses by MuJoCo's kinematics, no forces, and the others untouched."""
+"""Resets without collision detection, on both simulators: kinematic poses, no forces, other environments unchanged."""
 
 import copy
 
@@ -14,14 +14,14 @@ from tgdsl.runtime.simulators.state_values import FIELDS
 
 BOTH = pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
 DEEP = np.array([0, 0, 0.0295, 1, 0, 0, 0, 0.4, -0.1])
-"""The cube lies half a millimetre in the table, and the arm is elsewhere."""
+"""The cube penetrates the table by half a millimetre, and the arm is elsewhere."""
 
 
 def tensors(state) -> dict[str, torch.Tensor]:
     return {name: value.clone() for name, value in vars(state).items() if isinstance(value, torch.Tensor)}
 
 
-def started(simulator, tmp_path, num_envs=4, **options):
+def stepped_simulation(simulator, tmp_path, num_envs=4, **options):
     touch, model = wanting_contacts(tmp_path)
     sim = simulator(touch, num_envs, model=model, keyframe="home", **options)
     sim.reset(qvel=np.zeros(8))
@@ -32,8 +32,8 @@ def started(simulator, tmp_path, num_envs=4, **options):
 
 @BOTH
 @pytest.mark.parametrize("substeps", [1, 3])
-def test_poses_and_velocities_are_those_of_mujocos_kinematics_and_no_force_acts(tmp_path, simulator, substeps):
-    touch, sim = started(simulator, tmp_path, substeps=substeps)
+def test_reset_without_contacts_has_mujocos_kinematics_and_no_forces(tmp_path, simulator, substeps):
+    touch, sim = stepped_simulation(simulator, tmp_path, substeps=substeps)
     before = tensors(sim.state())
     qvel = np.linspace(-0.4, 0.3, sim.model.nv)
     mask = torch.tensor([False, True, False, True])
@@ -41,7 +41,7 @@ def test_poses_and_velocities_are_those_of_mujocos_kinematics_and_no_force_acts(
     after, data = tensors(sim.state()), mujoco.MjData(sim.model)
     data.qpos[:], data.qvel[:] = DEEP, qvel
     mujoco.mj_forward(sim.model, data)
-    assert data.ncon == 4  # who looked for contacts would find some
+    assert data.ncon == 4  # collision detection would find contacts
     for i, name in enumerate(touch.inputs.bodies):
         body, velocity = sim.model.body(name).id, np.zeros(6)
         mujoco.mj_objectVelocity(sim.model, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0)
@@ -60,13 +60,13 @@ def test_poses_and_velocities_are_those_of_mujocos_kinematics_and_no_force_acts(
 @BOTH
 @pytest.mark.parametrize("which", [[1], [3, 0], [0, 1, 2]], ids=["one", "few", "most"])
 @pytest.mark.parametrize("stored", ["none", "stored", "evaluate"])
-def test_some_environments_are_read_as_the_module_reads_them_of_the_whole_state(tmp_path, simulator, which, stored):
-    """After a reset, with and without stored contacts: `sim.read(mask)` is `touch(sim.state(), mask)` to the last bit."""
-    touch, sim = started(simulator, tmp_path)
+def test_reading_some_environments_matches_the_module_on_the_whole_state(tmp_path, simulator, which, stored):
+    """After a reset, with and without stored contacts: `sim.read(mask)` is bit-identical to `touch(sim.state(), mask)`."""
+    touch, sim = stepped_simulation(simulator, tmp_path)
     force = torch.arange(12.0, dtype=torch.float64).view(4, 1, 3).expand(-1, len(touch.inputs.pairs), -1)
     values = {"contact_found": torch.ones((4, len(touch.inputs.pairs))), "contact_netforce": force}
     slots = torch.zeros((4, len(touch.inputs.pairs), touch.inputs.slots, 3), dtype=torch.float64)
-    slots[:, :, 0] = force  # all that acts is shown
+    slots[:, :, 0] = force  # the slots show the whole force
     contacts = values | {"contact_force": slots} if stored == "stored" else stored
     touch.memory.keeps_last = True
     with torch.no_grad():
@@ -76,31 +76,31 @@ def test_some_environments_are_read_as_the_module_reads_them_of_the_whole_state(
         sim.reset(mask, contacts=contacts, qpos=DEEP)
         other = copy.deepcopy(touch)
         expected = other(sim.state(), mask)
-        read = sim.read(mask)
+        readings = sim.read(mask)
         again = sim.read(which)  # by indices, and a second time
     for name, reading in expected.items():
-        assert torch.equal(read[name], reading) and torch.equal(again[name], reading), name
-    assert any(reading[mask].any() for reading in read.values()) == (stored != "none")
+        assert torch.equal(readings[name], reading) and torch.equal(again[name], reading), name
+    assert any(reading[mask].any() for reading in readings.values()) == (stored != "none")
 
 
 @BOTH
-def test_the_step_after_is_that_of_a_start_with_a_look(tmp_path, simulator):
+def test_the_next_step_does_not_depend_on_evaluated_contacts(tmp_path, simulator):
     ends = []
     for contacts in ("none", "evaluate"):
-        _, sim = started(simulator, tmp_path)
+        _, sim = stepped_simulation(simulator, tmp_path)
         sim.reset([2], contacts=contacts, qpos=DEEP)
         sim.step(np.array([0.1, 0.1]))
         ends.append((sim.qpos.clone(), sim.qvel.clone(), tensors(sim.state())))
-    (qpos, qvel, state), (qpos_looked, qvel_looked, state_looked) = ends
-    assert torch.equal(qpos, qpos_looked) and torch.equal(qvel, qvel_looked)
+    (qpos, qvel, state), (qpos_evaluated, qvel_evaluated, state_evaluated) = ends
+    assert torch.equal(qpos, qpos_evaluated) and torch.equal(qvel, qvel_evaluated)
     assert state["contact_found"][2].any()
     for name, value in state.items():
-        assert torch.equal(value, state_looked[name]), name
+        assert torch.equal(value, state_evaluated[name]), name
 
 
 @BOTH
-def test_a_start_stored_with_its_contacts_feels_what_it_felt(tmp_path, simulator):
-    _, sim = started(simulator, tmp_path)
+def test_stored_contacts_are_restored(tmp_path, simulator):
+    _, sim = stepped_simulation(simulator, tmp_path)
     sim.reset([0], qpos=DEEP)
     stored = tensors(sim.state())
     start = {name: stored[name][0] for name in FIELDS if name in stored}
@@ -114,13 +114,13 @@ def test_a_start_stored_with_its_contacts_feels_what_it_felt(tmp_path, simulator
         if name in FIELDS:
             assert torch.equal(value[1], start[name]) and torch.equal(value[3], start[name]), name
             assert not value[2].any(), name
-    sim.forward([1])  # who looks after all finds what is there
+    sim.forward([1])  # evaluating finds the same contacts
     np.testing.assert_allclose(sim.state().contact_netforce[1], start["contact_netforce"], rtol=1e-5, atol=1e-6)
 
 
 @BOTH
-def test_what_contacts_cannot_be_is_named(tmp_path, simulator):
-    _, sim = started(simulator, tmp_path)
+def test_invalid_contacts_are_named(tmp_path, simulator):
+    _, sim = stepped_simulation(simulator, tmp_path)
     before = tensors(sim.state())
     with pytest.raises(
         SimulationError, match='contacts: this module wants no "contact_netfroce"; did you mean "contact_netforce"'
@@ -137,7 +137,7 @@ def test_what_contacts_cannot_be_is_named(tmp_path, simulator):
 
 
 @BOTH
-def test_reset_environments_alone_are_read_and_the_others_keep_their_rows(tmp_path, simulator):
+def test_reading_some_environments_keeps_the_rows_of_the_others(tmp_path, simulator):
     touch = module(tmp_path, noise={"white_noise": 1e-3})
     sim = simulator(touch, 3, keyframe="home")
     sim.step(np.zeros(2))
@@ -147,7 +147,7 @@ def test_reset_environments_alone_are_read_and_the_others_keep_their_rows(tmp_pa
     assert torch.equal(second[[0, 2]], first[[0, 2]]) and not torch.equal(second[1], first[1])
 
 
-# What drives a step, on both
+# Drives
 
 
 @BOTH
@@ -166,7 +166,7 @@ def test_a_drive_is_called_before_each_physics_step(tmp_path, simulator, substep
     torques, model = [], driven.model
 
     def drive() -> None:
-        """Damp the first joint of the arm by what its speed is now."""
+        """Damp the arm's first joint in proportion to its current speed."""
         torque = -0.02 * driven.qvel[:, 6]
         driven._arrays["qfrc_applied"][:, 6] = torque
         torques.append(float(torque[0]))

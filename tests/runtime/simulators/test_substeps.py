@@ -46,14 +46,14 @@ def snapshot(sim):
     return {name: np.array(getattr(sim.batch, name)) for name in names}
 
 
-def assert_same_state(found, expected, names):
+def assert_same_state(state, expected, names):
     for name in names:
-        a, b = getattr(found, name), getattr(expected, name)
+        a, b = getattr(state, name), getattr(expected, name)
         assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, name
 
 
-def test_five_substates_are_one_step_of_five(tmp_path):
-    """The simulator is left bit-identical, and so is the last state but for its dt."""
+def test_five_substates_equal_one_control_step(tmp_path):
+    """The simulator ends bit-identical, and so does the last state, except for `dt`."""
     _, at_once = simulation(tmp_path)
     touch, one_by_one = simulation(tmp_path)
     for control in CONTROLS:
@@ -67,8 +67,8 @@ def test_five_substates_are_one_step_of_five(tmp_path):
         assert_same_state(states[-1], at_once.state(), [name for name in touch.inputs.fields if name != "dt"])
 
 
-def test_substates_are_those_of_single_steps(tmp_path):
-    """Each is what a simulation whose control step is one physics step hands out, dt included."""
+def test_substates_equal_states_of_single_steps(tmp_path):
+    """Each equals the state of a simulation whose control step is one physics step, including `dt`."""
     _, fine = simulation(tmp_path, substeps=1)
     touch, coarse = simulation(tmp_path)
     for control in CONTROLS:
@@ -78,7 +78,7 @@ def test_substates_are_those_of_single_steps(tmp_path):
     assert all(name in SHAPES or name == "dt" for name in touch.inputs.fields)
 
 
-def test_dt_is_that_of_a_physics_step(tmp_path):
+def test_substates_have_the_dt_of_a_physics_step(tmp_path):
     _, sim = simulation(tmp_path)
     assert sim.state().dt == pytest.approx(0.010)
     assert [state.dt for state in sim.substates()] == pytest.approx([0.002] * 5)
@@ -95,7 +95,7 @@ def test_states_do_not_change_when_the_simulation_goes_on(tmp_path):
     assert not torch.equal(copies[0], copies[4])
 
 
-def test_who_stops_early_has_made_fewer_physics_steps(tmp_path):
+def test_stopping_early_takes_fewer_physics_steps(tmp_path):
     _, sim = simulation(tmp_path)
     for i, _ in enumerate(sim.substates(CONTROLS[0])):
         if i == 1:
@@ -106,7 +106,7 @@ def test_who_stops_early_has_made_fewer_physics_steps(tmp_path):
     np.testing.assert_array_equal(sim.batch.ctrl, CONTROLS[0])
 
 
-def test_without_controls_they_stay_as_they_were(tmp_path):
+def test_without_controls_the_last_ones_stay(tmp_path):
     _, sim = simulation(tmp_path)
     sim.step(CONTROLS[1])
     assert len(list(sim.substates())) == 5
@@ -120,7 +120,7 @@ def test_without_controls_they_stay_as_they_were(tmp_path):
         (np.array([[0.0], [np.nan], [0.0]]), r"^control is not finite in environments 1$"),
     ],
 )
-def test_bad_controls_step_nothing(tmp_path, control, message):
+def test_invalid_controls_take_no_step(tmp_path, control, message):
     _, sim = simulation(tmp_path)
     before = snapshot(sim)
     with pytest.raises(SimulationError, match=message):
@@ -142,8 +142,8 @@ def test_a_divergence_is_reported_where_it_happens(tmp_path, monkeypatch):
     assert len(list(sim.substates())) == 5
 
 
-def test_the_module_read_at_every_physics_step_is_that_of_a_finer_simulation(tmp_path):
-    """Noise, delay and hysteresis included: a reading knows the time since the last one, not who stepped."""
+def test_reading_every_substate_equals_reading_a_finer_simulation(tmp_path):
+    """Including noise, delay and hysteresis: readings depend on the time since the last one."""
     coarse_touch, coarse = simulation(tmp_path)
     fine_touch, fine = simulation(tmp_path, substeps=1)
     for control in CONTROLS[:3]:

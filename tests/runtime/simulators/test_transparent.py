@@ -1,4 +1,4 @@
-"""Objects whose geoms are not seen, as collision geoms often are: they are there all the same."""
+"""Objects with transparent geoms, as collision geoms often are: they still collide."""
 
 import mujoco
 import numpy as np
@@ -17,7 +17,7 @@ VARIANTS = [
     {"geoms": [{"type": "box", "size": [0.02, 0.02, 0.01]}, {"type": "box", "size": [0.01, 0.01, 0.01], "pos": [0, 0, 0.02]}]},
 ]
 HEIGHT = [0.03, 0.025, 0.02]
-"""Of each variant's origin at rest on the table [m]."""
+"""Height of each variant's origin at rest on the table [m]."""
 LOOKS = {"clear": 'rgba=".5 .5 .5 0"', "seen": 'rgba=".5 .5 .5 1"'}
 
 
@@ -28,7 +28,7 @@ def cube(folder, looks: str) -> tgdsl.TactileModule:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
-def test_what_is_transparent_lies_on_the_table_as_what_is_seen(tmp_path, simulator):
+def test_transparent_objects_rest_like_visible_ones(tmp_path, simulator):
     ends = []
     for looks in LOOKS:
         sim = simulator(cube(tmp_path, looks), 3)
@@ -40,19 +40,19 @@ def test_what_is_transparent_lies_on_the_table_as_what_is_seen(tmp_path, simulat
 
 
 @pytest.mark.parametrize("looks", list(LOOKS))
-def test_absence_is_what_the_plan_says(tmp_path, looks):
+def test_geoms_are_absent_where_the_plan_has_none(tmp_path, looks):
     touch = cube(tmp_path, looks)
     sim, target = BatchSimulation(touch, 3), touch.plan.scene.objects[0]
     for env in range(3):
         model = sim.env_model(env)
         body = model.body("cube")
-        found = [model.geom(i).name for i in range(model.ngeom) if model.geom_bodyid[i] == body.id and not is_absent(model, i)]
-        assert found == [geom_name(target, i) for i, geom in enumerate(target.variants[env]) if geom is not None]
+        names = [model.geom(i).name for i in range(model.ngeom) if model.geom_bodyid[i] == body.id and not is_absent(model, i)]
+        assert names == [geom_name(target, i) for i, geom in enumerate(target.variants[env]) if geom is not None]
         assert is_absent(model, model.geom("tgdsl/cube/0").id) == (target.variants[env][0] is None)
 
 
-def test_pictures_show_what_is_transparent_and_not_what_is_absent(tmp_path):
-    """The triangles of each variant fill the box that its geoms say."""
+def test_pictures_show_transparent_geoms_and_no_absent_ones(tmp_path):
+    """The triangles of each variant fill the bounding box of its geoms."""
     sizes = {}
     for looks in LOOKS:
         sim = BatchSimulation(cube(tmp_path, looks), 3)

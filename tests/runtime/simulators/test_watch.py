@@ -1,4 +1,4 @@
-"""What a task watches: MuJoCo's own functions for bodies and sites, of the instant that the module reads, on both simulators."""
+"""Bodies, sites and joints that a task watches: MuJoCo's values at the instant of the readings, on both simulators."""
 
 import mujoco
 import numpy as np
@@ -34,40 +34,42 @@ def one_step_ago(sim, env: int, control) -> mujoco.MjData:
 
 
 @BOTH
-def test_it_is_what_mujoco_has_at_the_instant_of_readings(tmp_path, simulator):
+def test_watched_values_match_mujoco_at_the_instant_of_readings(tmp_path, simulator):
     sim, tolerance = watching(simulator, tmp_path), 1e-12 if simulator is BatchSimulation else 2e-6
     for _ in range(30):
         sim.step(np.array([0.1, -0.2]))
     control = np.array([0.3, 0.2])
     data = one_step_ago(sim, 1, control)
     sim.step(control)
-    found, state = sim.watched(), sim.state()
-    assert torch.equal(found.body("cube").pos, state.body_pos[:, sim._touch.inputs.bodies.index("cube")].to(found.body_pos))
-    close = {"rtol": 1e-6 if tolerance > 1e-9 else 1e-12, "atol": tolerance}
+    watched, state = sim.watched(), sim.state()
+    assert torch.equal(watched.body("cube").pos, state.body_pos[:, sim._touch.inputs.bodies.index("cube")].to(watched.body_pos))
+    tolerances = {"rtol": 1e-6 if tolerance > 1e-9 else 1e-12, "atol": tolerance}
     for i, name in enumerate(WATCH.bodies):
         velocity = np.zeros(6)
         mujoco.mj_objectVelocity(sim.model, data, mujoco.mjtObj.mjOBJ_XBODY, sim.model.body(name).id, velocity, 0)
-        np.testing.assert_allclose(found.body_pos[1, i], data.body(name).xpos, **close)
-        np.testing.assert_allclose(found.body_quat[1, i], data.body(name).xquat, **close)
-        np.testing.assert_allclose(found.body_angvel[1, i], velocity[:3], **close)
-        np.testing.assert_allclose(found.body_linvel[1, i], velocity[3:], **close)
-    np.testing.assert_allclose(found.site_pos[1, 0], data.site("tip").xpos, **close)
-    turned = np.zeros(4)
-    mujoco.mju_mat2Quat(turned, data.site("tip").xmat)
-    assert abs(float(found.site_quat[1, 0] @ torch.from_numpy(turned).to(found.site_quat))) == pytest.approx(1, abs=1e-6)
+        np.testing.assert_allclose(watched.body_pos[1, i], data.body(name).xpos, **tolerances)
+        np.testing.assert_allclose(watched.body_quat[1, i], data.body(name).xquat, **tolerances)
+        np.testing.assert_allclose(watched.body_angvel[1, i], velocity[:3], **tolerances)
+        np.testing.assert_allclose(watched.body_linvel[1, i], velocity[3:], **tolerances)
+    np.testing.assert_allclose(watched.site_pos[1, 0], data.site("tip").xpos, **tolerances)
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, data.site("tip").xmat)
+    assert abs(float(watched.site_quat[1, 0] @ torch.from_numpy(quaternion).to(watched.site_quat))) == pytest.approx(
+        1, abs=1e-6
+    )
     for i, name in enumerate(WATCH.joints):
-        np.testing.assert_allclose(found.joint_pos[1, i], data.joint(name).qpos[0], **close)
-        np.testing.assert_allclose(found.joint_vel[1, i], data.joint(name).qvel[0], **close)
-        np.testing.assert_allclose(found.joint_effort[1, i], data.joint(name).qfrc_actuator[0], **close)
-    np.testing.assert_allclose(found.last_action[:, 0], 0.2, **close)
-    assert found.pair_force[1, 0, 2] < -1  # the cube lies on the table
+        np.testing.assert_allclose(watched.joint_pos[1, i], data.joint(name).qpos[0], **tolerances)
+        np.testing.assert_allclose(watched.joint_vel[1, i], data.joint(name).qvel[0], **tolerances)
+        np.testing.assert_allclose(watched.joint_effort[1, i], data.joint(name).qfrc_actuator[0], **tolerances)
+    np.testing.assert_allclose(watched.last_action[:, 0], 0.2, **tolerances)
+    assert watched.pair_force[1, 0, 2] < -1  # the cube lies on the table
     pair = [(p.link, p.object) for p in sim._touch.inputs.pairs].index(("table", "cube"))
-    assert torch.equal(found.pair_force[:, 0], state.contact_netforce[:, pair].to(found.pair_force))
+    assert torch.equal(watched.pair_force[:, 0], state.contact_netforce[:, pair].to(watched.pair_force))
 
 
 @BOTH
 @pytest.mark.parametrize("substeps", [1, 4])
-def test_watching_changes_nothing(tmp_path, simulator, substeps):
+def test_watching_does_not_change_the_simulation(tmp_path, simulator, substeps):
     ends = []
     for watch in (None, WATCH):
         sim = watching(simulator, tmp_path, watch, substeps=substeps)
@@ -76,12 +78,12 @@ def test_watching_changes_nothing(tmp_path, simulator, substeps):
             if watch:
                 sim.watched()
         ends.append((sim.qpos.clone(), sim.state().body_pos.clone()))
-    for one, other in zip(*ends, strict=True):
-        assert torch.equal(one, other)
+    for expected, result in zip(*ends, strict=True):
+        assert torch.equal(expected, result)
 
 
 @BOTH
-def test_after_a_reset_it_is_where_the_environment_is_and_efforts_are_zero(tmp_path, simulator):
+def test_reset_updates_watched_poses_and_zeroes_efforts(tmp_path, simulator):
     sim = watching(simulator, tmp_path)
     for _ in range(3):
         sim.step(np.array([0.4, -0.2]))
@@ -107,14 +109,14 @@ def test_after_a_reset_it_is_where_the_environment_is_and_efforts_are_zero(tmp_p
         (Watch(pairs=(("arm", "cube"),)), "no sensor of this module reads the whole force of cube on arm; add one of kind"),
     ],
 )
-def test_what_is_not_there_is_named(tmp_path, simulator, watch, message):
+def test_missing_names_are_refused(tmp_path, simulator, watch, message):
     with pytest.raises(SimulationError) as caught:
         watching(simulator, tmp_path, watch)
     assert str(caught.value).startswith(message)
 
 
 @BOTH
-def test_nothing_watched_is_said(tmp_path, simulator):
+def test_unwatched_names_are_refused(tmp_path, simulator):
     sim = watching(simulator, tmp_path, None)
     with pytest.raises(SimulationError, match="nothing is watched"):
         sim.watched()
@@ -122,7 +124,7 @@ def test_nothing_watched_is_said(tmp_path, simulator):
         watching(simulator, tmp_path).watched().body("pad")
 
 
-def test_quaternions_turn_and_multiply_as_mujocos():
+def test_quaternions_rotate_and_multiply_like_mujocos():
     rng = np.random.default_rng(0)
     one, two = (q / np.linalg.norm(q, axis=1, keepdims=True) for q in rng.normal(size=(2, 20, 4)))
     vectors = rng.normal(size=(20, 3))

@@ -1,6 +1,6 @@
-"""Contacts that are read from MuJoCo Warp's own, against MuJoCo's contact sensors in float64 on the same float32 states.
+"""Contacts read from MuJoCo Warp, against MuJoCo's contact sensors in float64 on the same float32 states.
 
-Forces come of two solvers: tolerances are those of contacts that slide, see `warp_cases`.
+Forces come from two solvers: tolerances are those for sliding contacts, see `warp_cases`.
 """
 
 import dataclasses
@@ -33,14 +33,14 @@ STACK = """
   </worldbody>
 </mujoco>
 """
-"""The table meets the cube link first, since its geom comes first, and so does the tip, a sphere; the lid meets it object first."""
+"""In contacts of table and tip with the cube, the link's geom is first; with the lid, the object's geom is first."""
 PAIRS = (Pair("table", "again"), Pair("cube", "hat"), Pair("table", "cube"), Pair("lid", "cube"), Pair("tip", "cube"))
-"""The first two bodies are those of the third; lid and cube are each the other's link; the pebble belongs to no pair."""
+"""The first two pairs alias bodies of others; lid and cube are each the other's link; the pebble is in no pair."""
 BODIES = {"cube": "cube", "again": "cube", "hat": "lid"}
 FIRST_IS_LINK = {("table", "cube"): True, ("lid", "cube"): False, ("tip", "cube"): True, ("cube", "hat"): False}
 
 
-def stacked(folder, cone="elliptic", condim=3, fields=CONTACTS, slots=6, pairs=PAIRS) -> TactileModule:
+def stacked_module(folder, cone="elliptic", condim=3, fields=CONTACTS, slots=6, pairs=PAIRS) -> TactileModule:
     """Return a module that wants contacts of some pairs."""
     touch = module(folder, STACK.format(cone=cone, condim=condim), links=("table", "lid", "tip"))
     assert set(touch.inputs.pairs) < set(PAIRS)
@@ -53,8 +53,8 @@ def instrumented(folder, touch, **changes) -> mujoco.MjModel:
     return tgdsl.instrument(spec, dataclasses.replace(touch.inputs, **changes)).compile()
 
 
-def moving(touch, num_envs, **keys) -> WarpSimulation:
-    """Return environments whose bodies are turned and pushed a little, each in its own way."""
+def moving_simulation(touch, num_envs, **keys) -> WarpSimulation:
+    """Return environments whose bodies are slightly turned and pushed, differently in each."""
     sim = warp(touch, num_envs, **keys)
     sim.warp_model.opt.tolerance.fill_(1e-8)  # MuJoCo's own
     rng = np.random.default_rng(0)
@@ -66,33 +66,33 @@ def moving(touch, num_envs, **keys) -> WarpSimulation:
     return sim
 
 
-def forwarded(model, sim) -> list[mujoco.MjData]:
-    """Return MuJoCo's data of each environment as it is now."""
-    found = []
+def forward_data(model, sim) -> list[mujoco.MjData]:
+    """Return MuJoCo's data for each environment's current state."""
+    datas = []
     for env in range(sim.num_envs):
         data = mujoco.MjData(model)
         for name in ("qpos", "qvel", "qacc_warmstart"):
             getattr(data, name)[:] = sim.arrays[name][env].numpy()
         mujoco.mj_forward(model, data)
-        found.append(data)
-    return found
+        datas.append(data)
+    return datas
 
 
-def sensed(model, sim) -> SceneState:
-    """Return the contacts that MuJoCo's sensors find in the environments as they are now."""
+def sensor_contacts(model, sim) -> SceneState:
+    """Return the contacts that MuJoCo's sensors find in the environments' current states."""
     slots, nets = [], []
-    for data in forwarded(model, sim):
+    for data in forward_data(model, sim):
         slots.append(np.stack([data.sensor(contact_sensor_names(pair)[0]).data.reshape(-1, 16) for pair in PAIRS]))
         nets.append(np.stack([data.sensor(contact_sensor_names(pair)[1]).data[1:4] for pair in PAIRS]))
-    own = np.stack(slots)
-    normal, tangent = own[..., 10:13], own[..., 13:16]
+    rows = np.stack(slots)
+    normal, tangent = rows[..., 10:13], rows[..., 13:16]
     axes = np.stack([normal, tangent, np.cross(normal, tangent)], axis=-2)
     values = {
-        "contact_found": own[:, :, 0, 0],
-        "contact_pos": own[..., 7:10],
+        "contact_found": rows[:, :, 0, 0],
+        "contact_pos": rows[..., 7:10],
         "contact_normal": normal,
-        "contact_force": np.einsum("...i,...ij->...j", own[..., 1:4], axes),
-        "contact_torque": np.einsum("...i,...ij->...j", own[..., 4:7], axes),
+        "contact_force": np.einsum("...i,...ij->...j", rows[..., 1:4], axes),
+        "contact_torque": np.einsum("...i,...ij->...j", rows[..., 4:7], axes),
         "contact_netforce": np.stack(nets),
     }
     return SceneState(**{name: torch.from_numpy(value) for name, value in values.items()})
@@ -103,73 +103,73 @@ def sensed(model, sim) -> SceneState:
 
 @pytest.mark.parametrize("condim", [1, 3, 6])
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
-def test_contacts_are_those_of_mujocos_sensors(tmp_path, cone, condim):
-    touch = stacked(tmp_path, cone, condim)
-    model, sim = instrumented(tmp_path, touch), moving(touch, 8)
-    expected = sensed(model, sim)
+def test_contacts_match_mujocos_sensors(tmp_path, cone, condim):
+    touch = stacked_module(tmp_path, cone, condim)
+    model, sim = instrumented(tmp_path, touch), moving_simulation(touch, 8)
+    expected = sensor_contacts(model, sim)
     sim.step()
     state = sim.state()
     assert_agree(state, expected, CONTACTS, MOVING_FORCE)
     assert all(getattr(state, name).dtype == torch.float32 and getattr(state, name).is_contiguous() for name in CONTACTS)
     assert (expected.contact_found > 0).all() and expected.contact_found.max() >= 4
     assert bool(expected.contact_torque.abs().max() > 1e-4) == (condim == 6)
-    data = forwarded(model, sim)[0]
-    bodies = {tuple(model.body(model.geom_bodyid[geom]).name for geom in own) for own in data.contact.geom}
+    data = forward_data(model, sim)[0]
+    bodies = {tuple(model.body(model.geom_bodyid[geom]).name for geom in geoms) for geoms in data.contact.geom}
     for (link, target), is_first in FIRST_IS_LINK.items():
         assert ((link, BODIES[target]) if is_first else (BODIES[target], link)) in bodies or (link, target) == ("cube", "hat")
     assert ("table", "pebble") in bodies or ("pebble", "table") in bodies
 
 
-def test_more_contacts_than_slots(tmp_path):
-    """All are counted and weighed; those that are kept are whole, and none twice."""
-    touch = stacked(tmp_path, slots=2)
-    model, sim = instrumented(tmp_path, touch, slots=8), moving(touch, 4)
-    expected = sensed(model, sim)
+def test_contacts_beyond_the_slots_are_counted_and_weighed(tmp_path):
+    """The contacts in slots are complete and distinct."""
+    touch = stacked_module(tmp_path, slots=2)
+    model, sim = instrumented(tmp_path, touch, slots=8), moving_simulation(touch, 4)
+    expected = sensor_contacts(model, sim)
     sim.step()
     state = sim.state()
     assert_agree(state, expected, ("contact_found", "contact_netforce"), MOVING_FORCE)
     assert state.contact_pos.shape == (4, 5, 2, 3) and expected.contact_found.max() == 4
-    apart = torch.cdist(state.contact_pos.double(), expected.contact_pos)
-    assert apart.amin(dim=-1)[expected.contact_found >= 2].max() < 1e-6
-    nearest = apart.argmin(dim=-1)
+    distances = torch.cdist(state.contact_pos.double(), expected.contact_pos)
+    assert distances.amin(dim=-1)[expected.contact_found >= 2].max() < 1e-6
+    nearest = distances.argmin(dim=-1)
     assert (nearest[..., 0] != nearest[..., 1])[expected.contact_found >= 2].all()
     for name, tolerance in {"contact_force": MOVING_FORCE, "contact_normal": TOLERANCE}.items():
-        whole = getattr(expected, name)
-        want = torch.gather(whole, 2, nearest[..., None].expand(4, 5, 2, 3))
+        values = getattr(expected, name)
+        nearest_value = torch.gather(values, 2, nearest[..., None].expand(4, 5, 2, 3))
         is_kept = torch.arange(2) < expected.contact_found[..., None]
-        error = (getattr(state, name) - want).abs().amax(dim=-1)[is_kept]
-        assert error.max() <= tolerance * whole.abs().max(), name
+        error = (getattr(state, name) - nearest_value).abs().amax(dim=-1)[is_kept]
+        assert error.max() <= tolerance * values.abs().max(), name
         assert not getattr(state, name)[~is_kept].any(), name
 
 
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
-def test_forces_are_those_that_mujoco_warp_gives_out(tmp_path, cone):
-    touch = stacked(tmp_path, cone, condim=6)
-    sim = moving(touch, 3)
+def test_forces_match_mujoco_warps_contact_force(tmp_path, cone):
+    touch = stacked_module(tmp_path, cone, condim=6)
+    sim = moving_simulation(touch, 3)
     sim.step()
-    state, (wp, mjw), own = sim.state(), libraries(), sim.warp_data.contact
+    state, (wp, mjw), contacts = sim.state(), libraries(), sim.warp_data.contact
     num = int(sim.arrays["nacon"][0])
     wrench = wp.zeros(num, dtype=wp.spatial_vector, device="cpu")
     mjw.contact_force(sim.warp_model, sim.warp_data, wp.array(np.arange(num), dtype=int, device="cpu"), True, wrench)
-    kept = {name: torch.zeros_like(getattr(state, name)) for name in ("contact_force", "contact_torque")}
+    arrays = {name: torch.zeros_like(getattr(state, name)) for name in ("contact_force", "contact_torque")}
     counts = torch.zeros(3, len(PAIRS), dtype=torch.int64)
-    for env, geoms, force in zip(own.worldid.numpy()[:num], own.geom.numpy()[:num], wrench.numpy(), strict=True):
+    for env, geoms, force in zip(contacts.worldid.numpy()[:num], contacts.geom.numpy()[:num], wrench.numpy(), strict=True):
         names = [sim.model.body(sim.model.geom_bodyid[geom]).name for geom in geoms]
         for i, pair in enumerate(PAIRS):
-            ours = [BODIES[pair.object], pair.link]
-            if sorted(ours) == sorted(names):
-                sign = 1 if names == ours else -1
-                kept["contact_force"][env, i, counts[env, i]] = sign * torch.from_numpy(force[:3])
-                kept["contact_torque"][env, i, counts[env, i]] = sign * torch.from_numpy(force[3:])
+            bodies = [BODIES[pair.object], pair.link]
+            if sorted(bodies) == sorted(names):
+                sign = 1 if names == bodies else -1
+                arrays["contact_force"][env, i, counts[env, i]] = sign * torch.from_numpy(force[:3])
+                arrays["contact_torque"][env, i, counts[env, i]] = sign * torch.from_numpy(force[3:])
                 counts[env, i] += 1
-    assert counts.min() > 0 and kept["contact_torque"].any()
+    assert counts.min() > 0 and arrays["contact_torque"].any()
     assert torch.equal(state.contact_found, counts.float())
-    for name, expected in kept.items():
+    for name, expected in arrays.items():
         torch.testing.assert_close(getattr(state, name), expected, rtol=0, atol=1e-6, msg=name)
-    torch.testing.assert_close(state.contact_netforce, kept["contact_force"].sum(dim=2), rtol=0, atol=1e-5)
+    torch.testing.assert_close(state.contact_netforce, arrays["contact_force"].sum(dim=2), rtol=0, atol=1e-5)
 
 
-# what is found, and when
+# wanted fields and resets
 
 
 @pytest.mark.parametrize(
@@ -181,40 +181,40 @@ def test_forces_are_those_that_mujoco_warp_gives_out(tmp_path, cone):
         (("contact_torque", "contact_pos"), {"contact_torque", "contact_pos", "contact_found"}),
     ],
 )
-def test_nothing_is_found_that_is_not_wanted(tmp_path, fields, found):
-    sims = [moving(stacked(tmp_path, condim=6, fields=own), 2) for own in (fields, CONTACTS)]
+def test_only_wanted_fields_are_computed(tmp_path, fields, found):
+    sims = [moving_simulation(stacked_module(tmp_path, condim=6, fields=wanted), 2) for wanted in (fields, CONTACTS)]
     for sim in sims:
         sim.step()
-    state, other = (sim.state() for sim in sims)
+    state, expected = (sim.state() for sim in sims)
     assert sims[0]._pairs.arrays.keys() == found
     for name in CONTACTS:
         assert (getattr(state, name) is None) == (name not in fields)
         if name in fields:
-            assert torch.equal(getattr(state, name), getattr(other, name)), name
+            assert torch.equal(getattr(state, name), getattr(expected, name)), name
 
 
 @pytest.mark.parametrize("pairs", [PAIRS, PAIRS[1:]])
-def test_a_state_stays_as_it_was(tmp_path, pairs):
-    """And environments that are reset read as at the start, the others as before."""
-    sim = moving(stacked(tmp_path, condim=6, pairs=pairs), 3)
+def test_states_do_not_change_when_the_simulation_goes_on(tmp_path, pairs):
+    """Reset environments read as at the start, the others as before."""
+    sim = moving_simulation(stacked_module(tmp_path, condim=6, pairs=pairs), 3)
     states = [sim.state()]
-    for _ in range(2):  # after the first step it is still the instant of the start
+    for _ in range(2):  # after one step, contacts are still at the instant of the start
         sim.step()
     states.append(sim.state())
-    kept = [{name: getattr(state, name).clone() for name in CONTACTS} for state in states]
-    start = warp(stacked(tmp_path, condim=6, pairs=pairs), 3).state()
+    copies = [{name: getattr(state, name).clone() for name in CONTACTS} for state in states]
+    start = warp(stacked_module(tmp_path, condim=6, pairs=pairs), 3).state()
     sim.reset(torch.tensor([False, True, False]))
     after = sim.state()
     for name in CONTACTS:
-        assert not torch.equal(kept[0][name], kept[1][name]) or name == "contact_found"
-        assert torch.equal(getattr(after, name)[[0, 2]], kept[1][name][[0, 2]]), name
+        assert not torch.equal(copies[0][name], copies[1][name]) or name == "contact_found"
+        assert torch.equal(getattr(after, name)[[0, 2]], copies[1][name][[0, 2]]), name
         torch.testing.assert_close(getattr(after, name)[1], getattr(start, name)[1], rtol=1e-4, atol=1e-6, msg=name)
     sim.step()
-    for state, values in zip(states, kept, strict=True):
+    for state, values in zip(states, copies, strict=True):
         assert all(torch.equal(getattr(state, name), value) for name, value in values.items())
 
 
-# sensors of the model's own
+# the model's own sensors
 
 OWN = """
   {custom}
@@ -226,34 +226,34 @@ OWN = """
 """
 
 
-def with_own_sensors(folder, touch, custom="") -> mujoco.MjModel:
+def model_with_sensors(folder, touch, custom="") -> mujoco.MjModel:
     (folder / "scene.xml").write_text((folder / "scene.xml").read_text().replace("</mujoco>", OWN.format(custom=custom)))
     return instrumented(folder, touch)
 
 
-def test_contact_sensors_of_the_models_own_are_evaluated(tmp_path):
-    """And no others: their part of `sensordata` stays empty."""
-    touch = stacked(tmp_path)
-    model = with_own_sensors(tmp_path, touch)
-    sim = moving(touch, 3, model=model)
-    data = forwarded(model, sim)
-    assert {int(model.sensor(name).needstage[0]) for name in ("load", "depth")} == {1, 3}  # of positions and of forces
+def test_the_models_own_contact_sensors_are_evaluated(tmp_path):
+    """The part of `sensordata` for tgdsl's sensors stays zero."""
+    touch = stacked_module(tmp_path)
+    model = model_with_sensors(tmp_path, touch)
+    sim = moving_simulation(touch, 3, model=model)
+    data = forward_data(model, sim)
+    assert {int(model.sensor(name).needstage[0]) for name in ("load", "depth")} == {1, 3}  # stages of positions and of forces
     sim.step()
     is_own = np.zeros(model.nsensordata, dtype=bool)
     for name in ("load", "depth"):
         sensor = model.sensor(name)
         part = slice(int(sensor.adr[0]), int(sensor.adr[0] + sensor.dim[0]))
         is_own[part] = True
-        expected = np.stack([own.sensordata[part] for own in data])
+        expected = np.stack([single.sensordata[part] for single in data])
         assert expected.all()
-        found = sim.arrays["sensordata"][:, part].numpy()
-        np.testing.assert_allclose(found, expected, rtol=0, atol=MOVING_FORCE * np.abs(expected).max())
+        values = sim.arrays["sensordata"][:, part].numpy()
+        np.testing.assert_allclose(values, expected, rtol=0, atol=MOVING_FORCE * np.abs(expected).max())
     assert not sim.arrays["sensordata"].numpy()[:, ~is_own].any()
 
 
-def test_too_many_contacts_for_a_sensor_of_the_models_own(tmp_path):
-    touch = stacked(tmp_path)
-    model = with_own_sensors(tmp_path, touch, '<custom><numeric name="contact_sensor_maxmatch" data="2"/></custom>')
+def test_too_many_contacts_for_the_models_own_sensor_are_an_error(tmp_path):
+    touch = stacked_module(tmp_path)
+    model = model_with_sensors(tmp_path, touch, '<custom><numeric name="contact_sensor_maxmatch" data="2"/></custom>')
     with pytest.raises(SimulationError) as caught:
         warp(touch, 2, model=model).step()
     assert str(caught.value) == (

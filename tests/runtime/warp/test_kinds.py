@@ -24,10 +24,10 @@ KINDS = {
 }
 FROM_FORCES = ("force", "force/missed", "force/residual", "solver")
 DRAGGED = 5e-5
-"""For the elastomer between simulators: the skin is dragged by some 0.1 mm, and float32 places 3 cm from the origin are good to
-2e-9 m, 2e-5 of it."""
+"""For the elastomer between simulators: the skin moves by about 0.1 mm, and float32 positions 3 cm from the origin are
+accurate to 2e-9 m, 2e-5 of that."""
 UNSHARED = ("force/missed", "force/residual")
-"""What is left of contact forces, a difference of forces: its error is theirs."""
+"""Remainders of contact forces: their error is that of the forces."""
 
 
 @pytest.fixture(scope="module")
@@ -44,22 +44,22 @@ def plan(tmp_path_factory):
     return tgdsl.compile(document).plan
 
 
-def errors(found, expected) -> dict[str, float]:
+def errors(readings, expected) -> dict[str, float]:
     """Return each reading's largest error over the largest magnitude of its channel, remainders' over the forces'.
 
-    A channel that hardly reads anything, below a thousandth of the reading's largest, counts as that large.
+    The scale of a channel is at least a thousandth of the reading's largest.
     """
     result = {}
-    for name, want in expected.items():
-        whole = expected["force" if name in UNSHARED else name].abs().max() + 1e-12
-        scale = whole if name in UNSHARED else want.abs().amax((0, 1)).clamp(min=1e-3 * float(whole))
-        result[name] = float(((found[name].double() - want.double()).abs() / scale).max())
+    for name, value in expected.items():
+        largest = expected["force" if name in UNSHARED else name].abs().max() + 1e-12
+        scale = largest if name in UNSHARED else value.abs().amax((0, 1)).clamp(min=1e-3 * float(largest))
+        result[name] = float(((readings[name].double() - value.double()).abs() / scale).max())
     return result
 
 
 @pytest.mark.slow
-def test_every_kind_reads_the_same_from_both(plan):
-    """The cube rocks on the table: both simulators, then both modules, are given the float32 state of the one."""
+def test_every_kind_reads_the_same_from_both_simulators(plan):
+    """The cube rocks on the table: both simulators, then both modules, get Warp's float32 state."""
     touch, exact = TactileModule(plan), TactileModule(plan, dtype=torch.float64)
     of_batch = TactileModule(plan, dtype=torch.float64)
     sim, cpu = warp(touch, 4), BatchSimulation(of_batch, 4)
@@ -67,42 +67,42 @@ def test_every_kind_reads_the_same_from_both(plan):
     sim.arrays["qvel"][:, :6] = torch.from_numpy(
         np.random.default_rng(0).normal(size=(4, 6)) * [0.05, 0.05, 0.02, 0.3, 0.3, 0.5]
     )
-    kept = []
+    steps = []
     for _ in range(12):
         hand_over(sim, cpu)
         sim.step()
         cpu.step()
         state = sim.state()
-        kept.append((touch(state), exact(state), of_batch(cpu.state())))
-    found, expected, batch = (
-        {name: torch.cat([one[name] for one in own]) for name in own[0]} for own in zip(*kept, strict=True)
+        steps.append((touch(state), exact(state), of_batch(cpu.state())))
+    readings, expected, batch = (
+        {name: torch.cat([step[name] for step in series]) for name in series[0]} for series in zip(*steps, strict=True)
     )
     assert all(expected[name].any() for name in KINDS)
-    for name, error in errors(found, expected).items():
+    for name, error in errors(readings, expected).items():
         assert error <= TOLERANCE, f"modules: {name} differs by {error:.1e}"
-    for name, error in errors(found, batch).items():
+    for name, error in errors(readings, batch).items():
         tolerance = MOVING_FORCE if name in FROM_FORCES else DRAGGED if name == "skin" else TOLERANCE
         assert error <= tolerance, f"simulators: {name} differs by {error:.1e}"
 
 
 @pytest.mark.slow
-def test_two_hundred_steps_of_a_cube_at_rest(plan):
-    """The taxels of `force_taxel` carry its weight, every reading is the CPU's to 0.1 %, and the cube is as deep in the table."""
+def test_a_cube_at_rest_reads_the_same_after_two_hundred_steps(plan):
+    """`force_taxel` carries its weight, readings match the CPU's to 0.1 %, and so does the depth in the table."""
     readings, heights = [], []
-    for own in (warp, BatchSimulation):
+    for simulator in (warp, BatchSimulation):
         touch = TactileModule(plan)
-        sim = own(touch, 2)
-        kept = []
+        sim = simulator(touch, 2)
+        means = []
         heights.append([])
         for i in range(200):
             sim.step()
             if i >= 150:
                 state = sim.state()
-                read = touch(state)
+                step_readings = touch(state)
                 heights[-1].append(state.body_pos[:, touch.inputs.bodies.index("cube"), 2].double())
-                kept.append({name: value.double().abs().mean() for name, value in read.items()})
-        readings.append({name: torch.stack([one[name] for one in kept]).mean() for name in kept[0]})
-        total = read["force"][..., :3].double().sum(dim=1)
+                means.append({name: value.double().abs().mean() for name, value in step_readings.items()})
+        readings.append({name: torch.stack([one[name] for one in means]).mean() for name in means[0]})
+        total = step_readings["force"][..., :3].double().sum(dim=1)
         expected = torch.tensor([0, 0, -WEIGHT], dtype=torch.float64).expand(2, 3)
         torch.testing.assert_close(total, expected, atol=1e-3, rtol=0)
     for name in KINDS:

@@ -1,4 +1,4 @@
-"""Loops on MuJoCo Warp: its constraints take velocities of the evaluation before, which must be those of the same environment."""
+"""Kinematic loops on MuJoCo Warp: constraints use velocities of the previous evaluation, which must belong to the same environment."""
 
 import warnings
 
@@ -21,7 +21,7 @@ SCENE = """
 <equality><connect body1="b" body2="c" anchor=".1 0 0"/></equality>
 <actuator><motor joint="side"/></actuator></mujoco>
 """
-"""Two chains that are joined, and a ball that touches one of them."""
+"""Two connected chains, and a ball that touches one of them."""
 BOTH = pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
 
 
@@ -41,27 +41,27 @@ def touch(tmp_path, monkeypatch):
 
 
 @BOTH
-def test_a_reset_leaves_the_others_alone(touch, simulator):
-    """Bit for bit, over steps that follow."""
+def test_reset_leaves_the_other_environments_alone(touch, simulator):
+    """Bit-identical, also over later steps."""
     sim, twin = simulator(touch, 2, substeps=2), simulator(touch, 2, substeps=2)
     for i in range(6):
         control = torch.tensor([[0.05], [0.02 + 0.01 * i]], dtype=torch.float64)
-        for own in (sim, twin):
-            own.step(control)
-            own.state()
+        for each in (sim, twin):
+            each.step(control)
+            each.state()
         sim.reset([0])
         sim.state()
         assert torch.equal(sim.qpos[1], twin.qpos[1]) and torch.equal(sim.qvel[1], twin.qvel[1]), i
 
 
 @BOTH
-def test_an_episode_does_not_depend_on_the_one_before(touch, simulator):
+def test_an_episode_does_not_depend_on_the_previous_one(touch, simulator):
     sim, fresh = simulator(touch, 2, substeps=2), simulator(touch, 2, substeps=2)
     speed = torch.linspace(-0.5, 0.5, sim.model.nv, dtype=torch.float64)
     for _ in range(4):
         sim.step(torch.full((1,), 0.1, dtype=torch.float64))
-    for own in (sim, fresh):
-        own.reset(qvel=speed, ctrl=torch.zeros(1, dtype=torch.float64), qacc_warmstart=torch.zeros(sim.model.nv))
+    for each in (sim, fresh):
+        each.reset(qvel=speed, ctrl=torch.zeros(1, dtype=torch.float64), qacc_warmstart=torch.zeros(sim.model.nv))
     first, expected = sim.state(), fresh.state()
     assert torch.equal(first.contact_netforce, expected.contact_netforce)
     for _ in range(3):
@@ -71,8 +71,8 @@ def test_an_episode_does_not_depend_on_the_one_before(touch, simulator):
 
 
 @BOTH
-def test_what_diverged_once_does_not_diverge_again(touch, simulator):
-    """The not-a-number of the episode before is in no array that the next one reads."""
+def test_a_diverged_environment_recovers(touch, simulator):
+    """Not-a-number of one episode reaches no array that the next one reads."""
     sim = simulator(touch, 2, substeps=2, on_fault="reset")
     sim.qvel[1, 0] = torch.nan
     with warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""Environments of MuJoCo Warp whose objects or fields of the model differ, against those of MuJoCo's batch."""
+"""MuJoCo Warp environments with different objects or model fields, against MuJoCo's batch."""
 
 import numpy as np
 import pytest
@@ -44,8 +44,8 @@ ITEMS = """
 """
 
 
-def items(folder) -> TactileModule:
-    """Return a module of two objects with variants and one with a size, on a table, and a post that is not the same either."""
+def items_module(folder) -> TactileModule:
+    """Return a module with two objects with variants and one with a size on a table, and a post with variants."""
     (folder / "items.xml").write_text(ITEMS)
     points = [{"pos": [0, 0, 0.01], "normal": [0, 0, 1], "radius": 0.005}]
     feels = ["first", "second", "rod"]
@@ -72,9 +72,9 @@ def items(folder) -> TactileModule:
 
 
 @pytest.mark.slow
-def test_environments_with_objects_of_their_own_are_those_of_the_cpu(tmp_path):
-    """Each environment against MuJoCo with a model compiled for it alone; geoms that it lacks must meet nothing at all."""
-    touch = items(tmp_path)
+def test_environments_with_different_objects_match_the_cpu(tmp_path):
+    """Each environment against MuJoCo with a model compiled for it; absent geoms must not collide."""
+    touch = items_module(tmp_path)
     sim, cpu = warp(touch, 8), BatchSimulation(touch, 8)
     sim.warp_model.opt.tolerance.fill_(sim.model.opt.tolerance)
     rng = np.random.default_rng(2)
@@ -102,8 +102,8 @@ def test_environments_with_objects_of_their_own_are_those_of_the_cpu(tmp_path):
 
 
 @pytest.mark.slow
-def test_meshes_among_the_variants(tmp_path):
-    """MuJoCo makes hulls of meshes in use alone: all environments need those of all."""
+def test_mesh_variants_match_the_cpu(tmp_path):
+    """MuJoCo builds hulls only for meshes in use: every environment needs the hulls of all variants."""
     trimesh.creation.icosphere(subdivisions=2, radius=0.03).apply_translation([0.01, 0.02, 0.02]).export(tmp_path / "ball.stl")
     trimesh.creation.box(extents=[0.05, 0.03, 0.06]).apply_translation([0, 0.01, 0]).export(tmp_path / "brick.stl")
     variants = [
@@ -128,7 +128,7 @@ def test_meshes_among_the_variants(tmp_path):
 
 
 @pytest.mark.slow
-def test_fields_of_the_model_that_environments_have_of_their_own(tmp_path):
+def test_environments_may_have_different_frictions(tmp_path):
     """Coulomb: a cube that slides on friction μ loses μ g of its speed per second."""
     touch = module(tmp_path, SCENE.replace('pos="0 0 .0299"', 'pos="0 0 .03"').replace('impratio="10"', 'impratio="100"'))
     sim = warp(touch, 2, per_env=["geom_friction"], substeps=50)

@@ -1,4 +1,4 @@
-"""Sound from MuJoCo Warp and from MuJoCo: joints and places at each physics step of a control step."""
+"""Sound from MuJoCo Warp and from MuJoCo: joints and positions at each physics step of a control step."""
 
 import pytest
 import torch
@@ -11,8 +11,8 @@ from tgdsl.runtime.batch.simulation import BatchSimulation
 
 
 @pytest.mark.slow
-def test_motors_and_a_microphone_in_both_simulators(tmp_path):
-    """Two arms in motion, heard on one of them and in the room, to a thousandth of the loudest after 30 control steps."""
+def test_motors_and_microphones_agree_in_both_simulators(tmp_path):
+    """Two moving arms, heard on one of them and in the room: equal to a thousandth of the maximum over 30 control steps."""
     (tmp_path / "scene.xml").write_text(SCENE)
     block = {"samples": 20, "substeps": 3}
     document = {
@@ -40,10 +40,10 @@ def test_motors_and_a_microphone_in_both_simulators(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_table_rings_by_where_a_cube_meets_it_in_both_simulators(tmp_path, monkeypatch):
-    """A cube falls 2 mm onto a table, beside its middle: gains at the contact, to a hundredth of the loudest.
+def test_contact_audio_agrees_in_both_simulators(tmp_path, monkeypatch):
+    """A cube falls 2 mm onto a table, off centre: equal to a hundredth of the maximum.
 
-    Simulators share out a face's load among its corners differently; centre and mean normal are alike.
+    Simulators distribute a face's load among its corners differently; centre and mean normal agree.
     """
     monkeypatch.setattr(spectra, "UNKNOWNS", 2500)
     (tmp_path / "scene.xml").write_text(SCENE.replace('name="cube" pos="0 0 .0299"', 'name="cube" pos=".02 .01 .032"'))
@@ -55,14 +55,14 @@ def test_a_table_rings_by_where_a_cube_meets_it_in_both_simulators(tmp_path, mon
         "objects": {"cube": {"body": "cube"}},
         "sensors": {"s": {**sensor, "modes": {"material": material, "count": 6}, "gains": "contact"}},
     }
-    plan, heard = tgdsl.compile(document).plan, []
+    plan, sounds = tgdsl.compile(document).plan, []
     for simulator in (warp, BatchSimulation):
         touch = TactileModule(plan)
         sim, blocks = simulator(touch, 2, substeps=2), []
         for _ in range(15):
             sim.step()
             blocks.append(touch(sim.state())["s"].cpu())
-        heard.append(torch.cat(blocks, dim=1))
-    assert heard[1].abs().max() > 1e-6
-    error = (heard[0] - heard[1]).abs().max() / heard[1].abs().max()
+        sounds.append(torch.cat(blocks, dim=1))
+    assert sounds[1].abs().max() > 1e-6
+    error = (sounds[0] - sounds[1]).abs().max() / sounds[1].abs().max()
     assert error < 0.01, f"differs by {error:.1e}"

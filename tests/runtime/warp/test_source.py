@@ -24,17 +24,17 @@ CONTROL = np.array([0.3, -0.2])
 # through `tgdsl.simulate`
 
 
-def test_a_gpu_is_asked_for_by_its_device_alone(tmp_path, monkeypatch):
-    touch, asked = module(tmp_path), {}
+def test_the_device_chooses_the_gpu_simulator(tmp_path, monkeypatch):
+    touch, arguments = module(tmp_path), {}
 
-    def started(self, touch, num_envs, **keys):
-        asked.update(keys, num_envs=num_envs)
+    def record_arguments(self, touch, num_envs, **keys):
+        arguments.update(keys, num_envs=num_envs)
 
-    monkeypatch.setattr(WarpSimulation, "__init__", functools.wraps(WarpSimulation.__init__)(started))
+    monkeypatch.setattr(WarpSimulation, "__init__", functools.wraps(WarpSimulation.__init__)(record_arguments))
     sim = tgdsl.simulate(touch, 7, device="cuda:1", substeps=5, keyframe="home", nconmax=20, njmax=90)
     assert isinstance(sim, WarpSimulation)
     keys = {"substeps": 5, "keyframe": "home", "nconmax": 20, "njmax": 90}
-    assert asked == {"num_envs": 7, "device": "cuda:1", **keys}
+    assert arguments == {"num_envs": 7, "device": "cuda:1", **keys}
     assert isinstance(tgdsl.simulate(touch, 1, device="cpu"), BatchSimulation)
 
 
@@ -47,7 +47,7 @@ def test_a_gpu_is_asked_for_by_its_device_alone(tmp_path, monkeypatch):
         ({"device": "tpu"}, r'^there is no device "tpu" to run physics on; expected "cuda" or "cpu"$'),
     ],
 )
-def test_arguments_for_another_device(tmp_path, keys, message):
+def test_options_of_another_device_are_refused(tmp_path, keys, message):
     with pytest.raises(SimulationError, match=message):
         tgdsl.simulate(module(tmp_path), 1, **keys)
 
@@ -55,7 +55,7 @@ def test_arguments_for_another_device(tmp_path, keys, message):
 # substep by substep
 
 
-def test_substates_are_those_of_single_steps(tmp_path):
+def test_substates_equal_states_of_single_steps(tmp_path):
     coarse_touch, fine_touch = (module(tmp_path, PRESSED, noise=NOISE) for _ in range(2))
     coarse, fine = warp(coarse_touch, 2, substeps=3, keyframe="home"), warp(fine_touch, 2, keyframe="home")
     at_once = warp(module(tmp_path, PRESSED, noise=NOISE), 2, substeps=3, keyframe="home")
@@ -64,23 +64,23 @@ def test_substates_are_those_of_single_steps(tmp_path):
         assert [state.dt for state in states] == pytest.approx([0.002] * 3)
         for state in states:
             fine.step(CONTROL)
-            other = fine.state()
+            expected = fine.state()
             for name in coarse_touch.inputs.fields:
-                assert torch.equal(torch.as_tensor(getattr(state, name)), torch.as_tensor(getattr(other, name))), name
-            assert torch.equal(coarse_touch(state)["touch"], fine_touch(other)["touch"])
+                assert torch.equal(torch.as_tensor(getattr(state, name)), torch.as_tensor(getattr(expected, name))), name
+            assert torch.equal(coarse_touch(state)["touch"], fine_touch(expected)["touch"])
         at_once.step(CONTROL)
         for name in ("qpos", "qvel", "time", "ctrl"):
             assert torch.equal(at_once.arrays[name], coarse.arrays[name]), name
     assert coarse.state().dt == pytest.approx(0.006)
 
 
-def test_who_stops_early_has_made_fewer_physics_steps(tmp_path):
+def test_stopping_early_takes_fewer_physics_steps(tmp_path):
     sim = warp(module(tmp_path), 2, substeps=4, keyframe="home")
     states = sim.substates(CONTROL)
     first = next(states)
-    kept = first.body_pos.clone()
+    copy = first.body_pos.clone()
     next(states)
-    assert torch.equal(first.body_pos, kept) and not torch.equal(kept, sim.state().body_pos)
+    assert torch.equal(first.body_pos, copy) and not torch.equal(copy, sim.state().body_pos)
     torch.testing.assert_close(sim.arrays["time"], torch.full((2,), 0.004))
     with pytest.raises(SimulationError, match=r"^control has shape \(3,\)"):
         next(sim.substates(np.zeros(3)))
@@ -90,7 +90,7 @@ def test_who_stops_early_has_made_fewer_physics_steps(tmp_path):
 
 
 @pytest.mark.parametrize("fields", [{"noise": NOISE}, {"history": 3}, {"noise": "noisy", "rate": "250 Hz"}])
-def test_stepping_and_reading_in_one_is_one_after_the_other(tmp_path, fields):
+def test_step_and_read_equals_step_then_read(tmp_path, fields):
     touch, other = (module(tmp_path, PRESSED, **fields) for _ in range(2))
     sim, twin = warp(touch, 2, keyframe="home"), warp(other, 2, keyframe="home")
     for i in range(4):
@@ -104,7 +104,7 @@ def test_stepping_and_reading_in_one_is_one_after_the_other(tmp_path, fields):
 
 
 class Forgetful:
-    """Counts how often a graph is forgotten, in place of a `GraphedCall`."""
+    """Stands in for a `GraphedCall`, and counts how often its graph is dropped."""
 
     def __init__(self, body):
         self.body, self.count = body, 0
@@ -116,35 +116,35 @@ class Forgetful:
         return self.body()
 
 
-def test_a_graph_is_captured_anew_when_the_module_holds_other_tensors_and_only_then(tmp_path):
+def test_a_graph_is_captured_again_only_when_the_modules_tensors_change(tmp_path):
     touch = module(tmp_path, PRESSED, noise={"white_noise": 5e-3, "hysteresis": {"strength": 0.5, "time_constant": 0.05}})
     sim = warp(touch, 2, substeps=2)
     sim._step_and_read = replay = Forgetful(sim._physics_and_touch)
 
-    def forgotten() -> int:
+    def num_dropped() -> int:
         before = replay.count
         sim.step_and_read()
         return replay.count - before
 
-    forgotten()  # what it remembers, and dt, are made during this call
-    assert [forgotten() for _ in range(3)] == [1, 0, 0]
+    num_dropped()  # this call creates the module's memory and `dt`
+    assert [num_dropped() for _ in range(3)] == [1, 0, 0]
     sim.reset([0])
     touch(sim.state())
     sim.step()
-    assert forgotten() == 0
+    assert num_dropped() == 0
     for state in sim.substates():
         touch(state)  # another dt
-    assert [forgotten() for _ in range(3)] == [1, 1, 0]
-    touch.seed(3)  # written in place, where a graph reads it
-    assert [forgotten() for _ in range(2)] == [0, 0]
+    assert [num_dropped() for _ in range(3)] == [1, 1, 0]
+    touch.seed(3)  # written in place: the graph stays valid
+    assert [num_dropped() for _ in range(2)] == [0, 0]
     touch.free()
-    assert [forgotten() for _ in range(3)] == [1, 1, 0]
+    assert [num_dropped() for _ in range(3)] == [1, 1, 0]
     touch.double()
-    assert forgotten() == 1
+    assert num_dropped() == 1
 
 
-def test_under_inference_mode(tmp_path):
-    """As rollouts of reinforcement learning run, whose tensors elsewhere refuse to be changed in place."""
+def test_step_and_read_works_under_inference_mode(tmp_path):
+    """As in rollouts of reinforcement learning: outside that mode, inference tensors refuse in-place changes."""
     touch, other = (module(tmp_path, PRESSED, noise=NOISE) for _ in range(2))
     sim, twin = warp(touch, 2), warp(other, 2)
     with torch.inference_mode():
@@ -163,7 +163,7 @@ def test_under_inference_mode(tmp_path):
 
 
 @pytest.mark.slow
-def test_rollouts_tables_and_pictures(tmp_path):
+def test_rollouts_tables_and_pictures_work_with_warp(tmp_path):
     touch = module(tmp_path, PRESSED)
     sims = warp(touch, 2, keyframe="home"), BatchSimulation(touch, 2, keyframe="home")
     controls = np.tile(CONTROL, (5, 1))
@@ -175,24 +175,24 @@ def test_rollouts_tables_and_pictures(tmp_path):
         assert draw(touch, sims[0], steps[0].readings, tmp_path / "one.png", env=1).stat().st_size > 10_000
 
 
-def test_poses_of_all_bodies_are_of_the_states_instant(tmp_path):
+def test_body_poses_match_the_cpu(tmp_path):
     touch = module(tmp_path)
     sims = warp(touch, 2, keyframe="home"), BatchSimulation(touch, 2, keyframe="home")
     for _ in range(2):
-        for found, expected in zip(sims[0].body_poses(1), sims[1].body_poses(1), strict=True):
-            np.testing.assert_allclose(found, expected, atol=1e-6)
+        for poses, expected in zip(sims[0].body_poses(1), sims[1].body_poses(1), strict=True):
+            np.testing.assert_allclose(poses, expected, atol=1e-6)
         for sim in sims:
             sim.step()
     sims[0].reset([1])
     assert np.abs(sims[0].body_poses(1)[0][-1] - warp(touch, 1, keyframe="home").body_poses(0)[0][-1]).max() < 1e-7
 
 
-def test_models_of_environments_have_the_objects_that_are_there(tmp_path):
+def test_env_model_has_the_environments_variant(tmp_path):
     variants = [{"type": "box", "size": [0.02, 0.02, 0.02]}, {"type": "sphere", "size": [0.015]}]
     touch = module(tmp_path, links=("table",), target={"variants": variants})
     sims = warp(touch, 3), BatchSimulation(touch, 3)
     for sim in sims:
-        sim.set_objects({"cube": [1, 0]}, env_ids=[2, 1])  # in any order, each with its own
+        sim.set_objects({"cube": [1, 0]}, env_ids=[2, 1])  # in any order
     for env, number in enumerate((0, 0, 1)):
         models = [sim.env_model(env) for sim in sims]
         np.testing.assert_array_equal(models[0].geom_rgba, models[1].geom_rgba)

@@ -1,8 +1,7 @@
 """MuJoCo Warp on its CPU device against MuJoCo's batch on the same states, and against Newton.
 
-What one state gives is float32 on one side, float64 on the other: poses and velocities agree to a few roundings. Forces follow
-from depths of some micrometres below positions of some centimetres, and from a solver: at rest they agree as well, in motion
-to less.
+One side is float32, the other float64: poses and velocities agree to a few roundings. Forces depend on a solver and on depths
+of a few micrometres at positions of a few centimetres: at rest they agree equally well, in motion less.
 """
 
 import copy
@@ -35,7 +34,7 @@ from tgdsl.runtime.warp.stream import GraphedCall, WarpStream
 
 
 class PretendedGpu(WarpStream):
-    """A stream that captures: its replays are counted and do nothing."""
+    """A capturing stream whose replays are counted and do nothing."""
 
     def __init__(self):
         super().__init__("cpu")
@@ -49,32 +48,32 @@ class PretendedGpu(WarpStream):
         self.replays += 1
 
 
-# the same readings as on the CPU
+# readings as on the CPU
 
 
 @pytest.mark.slow
-def test_one_state_gives_the_readings_of_the_cpu(tmp_path):
+def test_states_and_readings_match_the_cpu(tmp_path):
     touch, model = wanting_contacts(tmp_path)
     sim, cpu = warp(touch, 6, model=model, keyframe="home"), BatchSimulation(touch, 6, model=model, keyframe="home")
     assert_agree(sim.state(), cpu.state(), touch.inputs.fields)
     sim.warp_model.opt.tolerance.fill_(model.opt.tolerance)  # mujoco_warp's own is 100 times MuJoCo's
     pushed(sim, 0)
-    num_found = 0
+    num_active = 0
     for i in range(20):
         hand_over(sim, cpu)
         control = np.random.default_rng(i).normal(size=(6, 2))
         sim.step(control)
         cpu.step(control)
-        state, other = sim.state(), cpu.state()
-        assert_agree(state, other, touch.inputs.fields, MOVING_FORCE)
-        found, expected = touch(state)["touch"], touch(other)["touch"]
+        state, cpu_state = sim.state(), cpu.state()
+        assert_agree(state, cpu_state, touch.inputs.fields, MOVING_FORCE)
+        readings, expected = touch(state)["touch"], touch(cpu_state)["touch"]
         scale = expected.abs().amax((0, 1)) + 1e-12
-        assert ((found - expected).abs().amax((0, 1)) <= TOLERANCE * scale).all()
-        num_found += int((expected != 0).any())
-    assert num_found > 10
+        assert ((readings - expected).abs().amax((0, 1)) <= TOLERANCE * scale).all()
+        num_active += int((expected != 0).any())
+    assert num_active > 10
 
 
-def test_poses_and_contacts_are_those_at_the_start_of_the_last_substep(tmp_path):
+def test_poses_and_contacts_belong_to_the_start_of_the_last_substep(tmp_path):
     touch, model = wanting_contacts(tmp_path)
     keys = {"model": model, "keyframe": "home", "substeps": 4}
     sim, cpu = warp(touch, 2, **keys), BatchSimulation(touch, 2, **keys)
@@ -90,8 +89,8 @@ def test_poses_and_contacts_are_those_at_the_start_of_the_last_substep(tmp_path)
 @pytest.mark.parametrize(
     ("sensor", "times"), [("", 0), ('<jointpos joint="one"/>', 1), ('<jointpos joint="one" nsample="2" delay=".002"/>', 4)]
 )
-def test_sensors_are_evaluated_where_they_are_read(tmp_path, monkeypatch, sensor, times):
-    """Sensors are read after the last substep alone; one that remembers earlier steps needs them all, and ours need none."""
+def test_sensors_are_evaluated_only_when_read(tmp_path, monkeypatch, sensor, times):
+    """Sensors are evaluated at the last substep; one with a history needs every substep, tgdsl's need none."""
     touch = module(tmp_path)
     spec = mujoco.MjSpec.from_string(SCENE.replace("</mujoco>", f"<sensor>{sensor}</sensor></mujoco>"))
     tgdsl.instrument(spec, touch.inputs)
@@ -110,7 +109,7 @@ def test_sensors_are_evaluated_where_they_are_read(tmp_path, monkeypatch, sensor
 
 
 @pytest.mark.slow
-def test_a_resting_cube_weighs_what_it_weighs(tmp_path):
+def test_a_resting_cube_presses_with_its_weight(tmp_path):
     touch, model = wanting_contacts(tmp_path)
     sim = warp(touch, 2, model=model, substeps=300)
     sim.step()
@@ -122,20 +121,20 @@ def test_a_resting_cube_weighs_what_it_weighs(tmp_path):
     assert state.contact_netforce.dtype == torch.float32
 
 
-def test_stepping_and_reading_in_one(tmp_path):
+def test_step_and_read_equals_step_then_read(tmp_path):
     text = SCENE.replace('pos="0 0 .0299"', 'pos="0 0 .028"')
     modules = [module(tmp_path, text, kind="contact", threshold=1e-3, release_threshold=5e-4) for _ in range(2)]
     sim, twin = (warp(touch, 2, substeps=2) for touch in modules)
-    seen = []
+    contacts = []
     for _ in range(3):
         readings = sim.step_and_read(np.array([0.3, -0.2]))
         twin.step(np.array([0.3, -0.2]))
         torch.testing.assert_close(readings["touch"], modules[1](twin.state())["touch"], atol=0, rtol=0)
-        seen.append(bool(readings["touch"].any()))
-    assert seen[0]
+        contacts.append(bool(readings["touch"].any()))
+    assert contacts[0]
 
 
-def test_work_is_captured_at_its_third_call_and_then_replayed():
+def test_a_call_is_captured_the_third_time_and_then_replayed():
     stream, calls = PretendedGpu(), []
     replay = GraphedCall(stream, lambda: calls.append(0) or len(calls))
     assert [replay() for _ in range(5)] == [1, 2, 3, 3, 3]
@@ -146,8 +145,8 @@ def test_work_is_captured_at_its_third_call_and_then_replayed():
 
 
 @pytest.mark.slow
-def test_a_cube_at_rest_and_squeezed_fares_as_on_the_cpu():
-    """100 control steps on either side: 500 physics steps from float32 and from float64."""
+def test_a_cube_at_rest_and_squeezed_matches_the_cpu():
+    """100 control steps, 500 physics steps, in float32 and in float64."""
     touch = tgdsl.compile(Path(__file__).parents[3] / "examples" / "xhand1_palm.yaml")
     keys = {"substeps": 5, "keyframe": "rest"}
     modules = touch, copy.deepcopy(touch)
@@ -162,7 +161,7 @@ def test_a_cube_at_rest_and_squeezed_fares_as_on_the_cpu():
                 state = sim.state()
                 forces[which].append(modules[which](state)["touch"][..., :3].norm(dim=-1).sum(dim=1))
                 heights[which].append(state.body_pos[:, cube, 2].double())
-    force, expected = (torch.stack(own).mean(dim=0) for own in forces)
+    force, expected = (torch.stack(series).mean(dim=0) for series in forces)
     assert expected.min() > 5 and (expected[1:] - expected[0]).abs().max() > 0.5
     torch.testing.assert_close(force, expected, rtol=0.01, atol=0)
     torch.testing.assert_close(torch.stack(heights[0]).mean(0), torch.stack(heights[1]).mean(0), rtol=0, atol=1e-4)
@@ -171,7 +170,7 @@ def test_a_cube_at_rest_and_squeezed_fares_as_on_the_cpu():
 # resetting
 
 
-def test_reset_starts_the_named_environments_and_no_others(tmp_path):
+def test_reset_restarts_the_chosen_environments_and_no_others(tmp_path):
     touch, model = wanting_contacts(tmp_path)
     sims = [warp(touch, 4, model=model, keyframe="home") for _ in range(2)]
     start = sims[0].state()
@@ -183,18 +182,18 @@ def test_reset_starts_the_named_environments_and_no_others(tmp_path):
     sims[0].reset(torch.tensor([False, True, False, True]))
     after = sims[0].state()
     for name in touch.inputs.fields:
-        found = getattr(after, name)
-        torch.testing.assert_close(found[[0, 2]], getattr(before, name)[[0, 2]], atol=0, rtol=0, msg=name)
-        torch.testing.assert_close(found[[1, 3]], getattr(start, name)[[1, 3]], atol=1e-6, rtol=1e-6, msg=name)
+        value = getattr(after, name)
+        torch.testing.assert_close(value[[0, 2]], getattr(before, name)[[0, 2]], atol=0, rtol=0, msg=name)
+        torch.testing.assert_close(value[[1, 3]], getattr(start, name)[[1, 3]], atol=1e-6, rtol=1e-6, msg=name)
     assert (before.body_pos - start.body_pos).abs().amax(dim=(1, 2)).min() > 1e-3
     torch.testing.assert_close(sims[0].arrays["ctrl"][1], torch.tensor([0.1, -0.1]))
     for sim in sims:
         sim.step()
-    for name in ("qpos", "qvel"):  # and the others go on as if nothing had been
+    for name in ("qpos", "qvel"):  # the others go on as without a reset
         torch.testing.assert_close(sims[0].arrays[name][[0, 2]], sims[1].arrays[name][[0, 2]], atol=0, rtol=0)
 
 
-def test_reset_reaches_the_module_and_knows_its_environments(tmp_path):
+def test_reset_reaches_the_module_for_the_chosen_environments(tmp_path):
     text = SCENE.replace('pos="0 0 .0299"', 'pos="0 0 .028"')
     touch = module(tmp_path, text, links=("table",), kind="contact", threshold=1e-3, release_threshold=5e-4)
     sim = warp(touch, 3)
@@ -212,7 +211,7 @@ def test_reset_reaches_the_module_and_knows_its_environments(tmp_path):
             sim.reset(ids)
 
 
-# what goes wrong
+# errors
 
 
 def test_a_pool_that_is_too_small_is_named(tmp_path):
@@ -263,7 +262,7 @@ def test_a_diverging_environment_is_reported(tmp_path):
     torch.testing.assert_close(sim.arrays["qpos"][[0, 2]], twin.arrays["qpos"][[0, 2]], atol=0, rtol=0)
 
 
-def test_controls(tmp_path):
+def test_controls_are_checked_broadcast_and_kept(tmp_path):
     sim = warp(module(tmp_path), 3, keyframe="home")
     before = sim.arrays["qpos"].clone()
     for control in (np.zeros(3), np.zeros((2, 2)), np.zeros((3, 1)), np.zeros((1, 3, 2)), np.asarray(1.0)):
@@ -291,12 +290,12 @@ def test_controls(tmp_path):
         ({"device": "meta"}, r'^physics on "meta" is not supported, expected "cuda" or "cpu"$'),
     ],
 )
-def test_what_cannot_be_simulated_is_refused_by_name(tmp_path, keys, message):
+def test_invalid_options_are_named(tmp_path, keys, message):
     with pytest.raises(SimulationError, match=message):
         WarpSimulation(module(tmp_path), 2, **{"device": "cpu", **keys})
 
 
-def test_a_model_of_your_own_needs_what_the_module_wants(tmp_path):
+def test_a_users_model_needs_the_modules_bodies(tmp_path):
     touch = module(tmp_path)
     sims = warp(touch, 1), warp(touch, 1, model=mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml")))
     assert (sims[0].model.nsensor, sims[1].model.nsensor) == (2, 0)
@@ -315,13 +314,13 @@ def test_a_model_of_your_own_needs_what_the_module_wants(tmp_path):
         ('<option><flag sleep="enable"/></option>', r"^bodies that sleep are not supported"),
     ],
 )
-def test_what_would_mix_instants_is_refused(tmp_path, option, message):
+def test_options_that_mix_instants_are_refused(tmp_path, option, message):
     touch = module(tmp_path, SCENE.replace("<worldbody>", option + "<worldbody>").replace(' integrator="implicitfast"', ""))
     with pytest.raises(SimulationError, match=message):
         warp(touch, 1)
 
 
-def test_without_mujoco_warp(tmp_path, monkeypatch):
+def test_without_mujoco_warp_the_extra_is_named(tmp_path, monkeypatch):
     touch = module(tmp_path)
     monkeypatch.setitem(sys.modules, "mujoco_warp", None)
     with pytest.raises(SimulationError, match=r'^physics on a GPU needs MuJoCo Warp: pip install "tgdsl\[gpu\]"$'):
