@@ -1,4 +1,4 @@
-"""Hands without keyframes close on an object by themselves: two links or more are pressed, whatever drives the hand."""
+"""Hands without keyframes close on an object: any kind of drive presses at least two links."""
 
 import functools
 import warnings
@@ -28,12 +28,12 @@ HANDS = {
     "four_bar.xml": FOUR_BAR,
 }
 BALL_RADII = {"capsules.xml": 0.02, "tendon.xml": 0.016}
-"""Of balls that the hand can hold between fingers and palm: one of 12 mm the tendon hand presses 3 mm into its palm [m]."""
+"""Radii of balls that fit between fingers and palm; the tendon hand would press one of 12 mm 3 mm into its palm [m]."""
 SECONDS = 1.0
 HELD_ATOL = 2e-3
-"""How far soft constraints let held joints go under the forces of a grip [rad, m]."""
+"""How far soft constraints let held joints move under the forces of a grip [rad, m]."""
 SOLVER_RTOL = 0.02
-"""What presses is at rest up to the drag of the object."""
+"""The grip is at rest except for the drag of the object."""
 
 
 def module(folder: Path, name: str, text: str, objects: dict | None = None, scene: str = "") -> tgdsl.TactileModule:
@@ -53,7 +53,7 @@ def module(folder: Path, name: str, text: str, objects: dict | None = None, scen
 
 
 def closed(touch: tgdsl.TactileModule, num_envs: int = 1) -> tuple[Closing, BatchSimulation, torch.Tensor]:
-    """Close the hand; return how, the simulation at its end, and the force on each link (env, link) [N]."""
+    """Close the hand; return its closing, the final simulation, and the force on each link (env, link) [N]."""
     closing = closing_of(touch)
     assert isinstance(closing, Closing), closing
     sim = BatchSimulation(touch, num_envs, substeps=5, keyframe=START, prepare=closing.prepare)
@@ -66,7 +66,7 @@ def closed(touch: tgdsl.TactileModule, num_envs: int = 1) -> tuple[Closing, Batc
 
 @pytest.fixture(scope="module")
 def closed_on_ball(tmp_path_factory) -> Callable[[str], tuple[Closing, BatchSimulation, torch.Tensor]]:
-    """Close a hand of `HANDS` on a ball, once."""
+    """Close a hand of `HANDS` on a ball; results are cached."""
 
     @functools.cache
     def close(name: str) -> tuple[Closing, BatchSimulation, torch.Tensor]:
@@ -77,8 +77,8 @@ def closed_on_ball(tmp_path_factory) -> Callable[[str], tuple[Closing, BatchSimu
 
 
 def forces_on(sim: BatchSimulation, body: str, env: int = 0) -> dict[str, float]:
-    """Return the normal forces between a body and others, by MuJoCo's own function [N]."""
-    model, force, found = sim.env_model(env), np.zeros(6), dict[str, float]()
+    """Return the normal forces between a body and others, from MuJoCo's function [N]."""
+    model, force, forces = sim.env_model(env), np.zeros(6), dict[str, float]()
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:], data.ctrl[:] = sim.qpos[env], sim.qvel[env], sim.ctrl[env]
     mujoco.mj_forward(model, data)
@@ -87,8 +87,8 @@ def forces_on(sim: BatchSimulation, body: str, env: int = 0) -> dict[str, float]
         if body in names:
             mujoco.mj_contactForce(model, data, i, force)
             other = names[1 - names.index(body)]
-            found[other] = found.get(other, 0.0) + float(force[0])
-    return found
+            forces[other] = forces.get(other, 0.0) + float(force[0])
+    return forces
 
 
 @pytest.mark.slow
@@ -99,7 +99,7 @@ def test_at_least_two_links_are_pressed(closed_on_ball, name):
     assert len(pressed) >= 2 and (load[0] > 0).sum() >= 2
     assert torch.isfinite(sim.qpos).all() and closing.target == "ball" and closing.place is not None
     depth = -min(contact.dist for contact in _contacts(sim))
-    assert depth < 0.2 * BALL_RADII.get(name, 0.012)  # forces that soft contacts can bear
+    assert depth < 0.2 * BALL_RADII.get(name, 0.012)  # soft contacts can bear the forces
 
 
 def _contacts(sim: BatchSimulation):
@@ -110,15 +110,15 @@ def _contacts(sim: BatchSimulation):
 
 
 @pytest.mark.slow
-def test_a_gripper_presses_with_the_object_s_weight_and_its_arm_stays(closed_on_ball):
-    """By virtual work a servo that both jaws follow gives each half its force; the arm's motor, at zero, bears nothing."""
+def test_a_gripper_presses_in_proportion_to_the_weight_and_its_arm_stays(closed_on_ball):
+    """By virtual work, a servo that both jaws follow gives each half its force; the arm's motor is at zero."""
     closing, sim, _ = closed_on_ball("gripper.xml")
     assert str(closing) == "the hand closes on `ball`, put between the fingers, without gravity; 1 of 1 joints"
     np.testing.assert_allclose(closing.place[:2], 0.0, atol=1e-9)  # midway between the jaws
     mass = float(sim.model.body("ball").mass[0])
-    found = forces_on(sim, "ball")
-    assert found.keys() == {"left", "right"}
-    assert sum(found.values()) == pytest.approx(GRIP * mass * 9.81, rel=SOLVER_RTOL)
+    forces = forces_on(sim, "ball")
+    assert forces.keys() == {"left", "right"}
+    assert sum(forces.values()) == pytest.approx(GRIP * mass * 9.81, rel=SOLVER_RTOL)
     for joint in ("lift", "turn"):
         assert abs(float(sim.qpos[0, sim.joints[joint].qpos])) < HELD_ATOL
     assert float(sim.qpos[0, sim.joints["left slide"].qpos]) == pytest.approx(0.012, abs=1e-3)  # the ball's radius
@@ -133,7 +133,7 @@ def test_forces_are_bounded_on_a_heavy_object(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_same_scene_closes_alike(closed_on_ball, tmp_path):
+def test_the_same_scene_closes_the_same_way(closed_on_ball, tmp_path):
     _, sim, _ = closed(module(tmp_path, "gripper.xml", GRIPPER))
     assert torch.equal(sim.qpos, closed_on_ball("gripper.xml")[1].qpos)
 
@@ -161,7 +161,7 @@ def scene(bodies: str, rest: str = "") -> str:
 
 
 @pytest.mark.slow
-def test_what_is_between_the_fingers_stays_there(tmp_path):
+def test_an_object_between_the_fingers_stays_there(tmp_path):
     text = scene(
         "<body name='egg' pos='.002 .003 .435'><freejoint/><geom type='ellipsoid' size='.01 .012 .014' mass='.02'/></body>"
     )
@@ -173,7 +173,7 @@ def test_what_is_between_the_fingers_stays_there(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_first_object_that_fits_is_taken(tmp_path):
+def test_the_first_object_that_fits_is_the_target(tmp_path):
     bodies = "<body name='table' pos='0 0 -1'><geom type='box' size='.3 .3 .01'/></body>"
     bodies += "<body name='crate' pos='1 0 .3'><freejoint/><geom type='box' size='.3 .3 .3' mass='5'/></body>"
     bodies += "<body name='pen' pos='2 0 .3'><freejoint/><geom type='capsule' size='.004 .05' mass='.01'/></body>"
@@ -199,7 +199,7 @@ def test_the_first_object_that_fits_is_taken(tmp_path):
         ),
     ],
 )
-def test_why_it_does_not_close_on_an_object(tmp_path, bodies, name, why):
+def test_a_reason_says_why_it_does_not_close_on_an_object(tmp_path, bodies, name, why):
     assert closing_of(module(tmp_path, "gripper.xml", GRIPPER, {name: {"body": name}}, scene(bodies))) == why
 
 
@@ -218,12 +218,12 @@ def test_a_fixed_object_within_reach_is_pressed(tmp_path):
         ("<joint type='hinge' axis='0 1 0' range='-60 60'/>", "which way its joints close is not clear"),
     ],
 )
-def test_why_a_hand_does_not_close(tmp_path, joint, why):
+def test_a_reason_says_why_a_hand_does_not_close(tmp_path, joint, why):
     text = f"<mujoco><worldbody><body name='pad'>{joint}<geom type='box' size='.03 .03 .01'/></body></worldbody></mujoco>"
     assert closing_of(module(tmp_path, "pad.xml", text)) == why
 
 
-def test_the_servos_take_nothing_of_the_scene_s_defaults(tmp_path):
+def test_servos_ignore_the_scenes_defaults(tmp_path):
     ball, ends = {"ball": {"geom": {"type": "sphere", "size": [0.012]}}}, []
     plain = GRIPPER.replace('<position name="grip" joint="left slide" kp="200" ctrlrange="0 .04"/>', "")
     defaults = plain.replace("<default>", '<default><general gear="3" ctrllimited="true" forcerange="-1 1" biasprm="1 2 3"/>')
@@ -234,7 +234,7 @@ def test_the_servos_take_nothing_of_the_scene_s_defaults(tmp_path):
     np.testing.assert_allclose(ends[1], ends[0], atol=1e-9)
 
 
-def test_limits_that_look_like_radians_read_as_degrees_are_warned_of(tmp_path):
+def test_ranges_in_radians_read_as_degrees_are_warned_of(tmp_path):
     text = world(hinged_jaws())
     misread = text.replace('range="0 40"', 'range="0 .7"')
     assert misread != text
@@ -247,7 +247,7 @@ def test_limits_that_look_like_radians_read_as_degrees_are_warned_of(tmp_path):
 
 
 @pytest.mark.slow
-def test_objects_that_differ_between_environments(tmp_path):
+def test_a_hand_closes_on_different_objects_per_environment(tmp_path):
     variants = [{"type": "sphere", "size": [0.012]}, {"type": "box", "size": [0.01, 0.011, 0.012]}]
     touch = module(tmp_path, "gripper.xml", GRIPPER, {"thing": {"variants": variants}})
     _, sim, load = closed(touch, num_envs=2)
@@ -256,7 +256,7 @@ def test_objects_that_differ_between_environments(tmp_path):
 
 
 @pytest.mark.slow
-def test_others_keep_their_actuators_and_groups_that_rest_stay_at_rest(tmp_path):
+def test_other_actuators_and_disabled_groups_stay_unchanged(tmp_path):
     bodies = (
         "<body name='fan' pos='1 0 0'><joint name='spin' axis='0 0 1' damping='.01'/><geom type='box' size='.1 .1 .01'/></body>"
     )
@@ -271,7 +271,7 @@ def test_others_keep_their_actuators_and_groups_that_rest_stay_at_rest(tmp_path)
 
 
 def fan(groups) -> str:
-    """Return a fan with a motor in each of some groups."""
+    """Return a scene with a fan that has a motor in each group."""
     motors = "".join(f"<velocity joint='spin' kv='.01' group='{group}'/>" for group in groups)
     body = (
         "<body name='fan' pos='1 0 0'><joint name='spin' axis='0 0 1' damping='.01'/><geom type='box' size='.1 .1 .01'/></body>"
@@ -281,8 +281,8 @@ def fan(groups) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("disabled", ["30", "7"])
-def test_one_group_that_is_free_or_disabled_is_enough(tmp_path, disabled):
-    """The hand's actuators rest in it, and the servos act in one that MuJoCo cannot disable."""
+def test_one_free_or_disabled_group_is_enough(tmp_path, disabled):
+    """The hand's actuators rest in it, and the servos are in a group that MuJoCo cannot disable."""
     groups = range(30) if disabled == "30" else range(31)
     text = fan(groups).replace(
         "</mujoco>", f"<option actuatorgroupdisable='{disabled}'/></mujoco>" if disabled == "7" else "</mujoco>"
@@ -294,7 +294,7 @@ def test_one_group_that_is_free_or_disabled_is_enough(tmp_path, disabled):
     assert (load[0] > 0).sum() >= 2
 
 
-def test_groups_that_others_have_all_taken_are_an_error(tmp_path):
+def test_no_free_actuator_group_is_an_error(tmp_path):
     closing = closing_of(module(tmp_path, "gripper.xml", GRIPPER, {"ball": BALL, "fan": {"body": "fan"}}, fan(range(31))))
     assert isinstance(closing, Closing)
     spec = mujoco.MjSpec.from_file(str(tmp_path / "scene.xml"))
@@ -302,7 +302,7 @@ def test_groups_that_others_have_all_taken_are_an_error(tmp_path):
         closing.prepare(spec)
 
 
-# Two fingers of three joints, of which the second follows the first, and the third the second.
+# Two fingers of three joints: the second follows the first, and the third the second.
 CHAINED = world(
     finger("left", ".03 0 .05", "0 0 180") + finger("right", "-.03 0 .05") + '<geom type="box" size=".05 .02 .015"/>'
 )
@@ -330,7 +330,7 @@ def test_a_joint_that_follows_a_follower_closes_too(tmp_path, order):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", ["xhand1", "sharpa"])
-def test_hands_with_many_fingers(robot):
+def test_hands_with_many_fingers_close(robot):
     document = {
         "tgdsl": 1,
         "robot": {"model": robot},

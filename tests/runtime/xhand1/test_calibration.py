@@ -1,4 +1,4 @@
-"""Calibration files: what they do to counts, by hand, and what is wrong with them, at its place."""
+"""Calibration files: counts converted by hand, and errors with their line and column."""
 
 from pathlib import Path
 
@@ -28,7 +28,7 @@ def read(tmp_path: Path, text: str) -> Calibration:
     return load_calibration(path)
 
 
-def said(tmp_path: Path, text: str) -> list[str]:
+def problems_of(tmp_path: Path, text: str) -> list[str]:
     with pytest.raises(SpecError) as caught:
         read(tmp_path, text)
     return [str(problem).removeprefix(f"{tmp_path}/") for problem in caught.value.problems]
@@ -50,7 +50,7 @@ def test_counts_become_forces(tmp_path):
     assert calibration.apply(many) == pytest.approx(np.broadcast_to(expected, (4, 2, 5, 3)), abs=1e-12)
 
 
-def test_forces_become_the_counts_that_give_them(tmp_path):
+def test_counts_of_inverts_apply(tmp_path):
     calibration = read(tmp_path, GOOD)
     counts = np.random.default_rng(0).uniform(-100, 100, (7, 5, 3))
     assert calibration.counts_of(calibration.apply(counts)) == pytest.approx(counts, abs=1e-9)
@@ -62,18 +62,18 @@ def test_without_a_file_counts_stay_counts():
     assert Calibration.none().units == "counts"
 
 
-def test_a_tare_is_what_reads_zero():
+def test_a_tare_reads_zero():
     mean = np.arange(15, dtype=np.float64).reshape(5, 3)
     tared = Calibration.none().with_tare(Tare(mean, np.zeros((5, 3)), 20))
     assert (tared.apply(mean) == 0).all()
 
 
-def test_a_file_comes_back(tmp_path):
+def test_a_file_round_trips(tmp_path):
     calibration = read(tmp_path, GOOD)
-    again = read(tmp_path, calibration.text())
+    reloaded = read(tmp_path, calibration.text())
     for name in ("scale", "rotation", "bias", "tare"):
-        assert (getattr(again, name) == getattr(calibration, name)).all()
-    assert (again.units, again.hand) == ("N", "right hand, no. 7")
+        assert (getattr(reloaded, name) == getattr(calibration, name)).all()
+    assert (reloaded.units, reloaded.hand) == ("N", "right hand, no. 7")
 
 
 @pytest.mark.parametrize(
@@ -114,24 +114,24 @@ def test_a_file_comes_back(tmp_path):
         ("units: N\n", "units: N\nunits: N\n", ["hand.yaml:4:1: units: this key stands twice, first in line 3"]),
     ],
 )
-def test_mistakes_are_found_at_their_place(tmp_path, old, new, messages):
+def test_mistakes_have_their_line_and_column(tmp_path, old, new, messages):
     assert old in GOOD
-    assert said(tmp_path, GOOD.replace(old, new)) == messages
+    assert problems_of(tmp_path, GOOD.replace(old, new)) == messages
 
 
-def test_the_contact_threshold(tmp_path):
+def test_the_contact_threshold_is_optional_and_positive(tmp_path):
     assert read(tmp_path, GOOD).contact_threshold is None
     calibration = read(tmp_path, GOOD.replace("units: N\n", "units: N\ncontact_threshold: 0.35\n"))
     assert calibration.contact_threshold == 0.35
     assert read(tmp_path, calibration.text()).contact_threshold == 0.35
-    assert said(tmp_path, GOOD.replace("units: N\n", "units: N\ncontact_threshold: 0\n")) == [
+    assert problems_of(tmp_path, GOOD.replace("units: N\n", "units: N\ncontact_threshold: 0\n")) == [
         "hand.yaml:4:20: contact_threshold: 0 is out of range, expected more than 0"
     ]
 
 
-def test_files_that_cannot_be_read(tmp_path):
-    assert said(tmp_path, "") == ["hand.yaml:1:1: the document is empty"]
-    assert said(tmp_path, "- 1\n") == ["hand.yaml:1:1: found a list of 1, expected a mapping"]
+def test_unreadable_files_are_refused(tmp_path):
+    assert problems_of(tmp_path, "") == ["hand.yaml:1:1: the document is empty"]
+    assert problems_of(tmp_path, "- 1\n") == ["hand.yaml:1:1: found a list of 1, expected a mapping"]
     with pytest.raises(SpecError, match="cannot read this file: No such file"):
         load_calibration(tmp_path / "none.yaml")
     (tmp_path / "bad.yaml").write_bytes(b"\xff")

@@ -30,7 +30,7 @@ CALM = SerialTiming(reply_timeout_s=0.5, silence_s=0.4)
 BRISK = SerialTiming(reply_timeout_s=0.2, silence_s=0.1)
 
 
-def test_every_reading_is_new_and_knows_its_age():
+def test_every_reading_is_new_and_has_its_age():
     stamps = Stamps()
     with (
         FaultyEmulator(first_order_hand(forces=stamps)) as emulator,
@@ -41,8 +41,8 @@ def test_every_reading_is_new_and_knows_its_age():
     assert np.all(np.diff([stamps.check(reading) for reading in readings]) > 0)
 
 
-def test_reading_writes_the_passive_and_the_version_request_and_nothing_else():
-    """Every byte, over failures of all kinds, a pulled cable and the end."""
+def test_reading_writes_only_passive_and_version_requests():
+    """Every byte is checked, through faults of all kinds, an unplugged cable and the end."""
     written, stamps = WrittenBytes(), Stamps()
     with FaultyEmulator(first_order_hand(forces=stamps), faults=Faults.each(0.1)) as emulator:
         with open_again(emulator.device, timing=BRISK, open_port=written.open) as hand:
@@ -65,11 +65,11 @@ def test_reading_writes_the_passive_and_the_version_request_and_nothing_else():
         assert (joint.mode, joint.kp, joint.ki, joint.kd, joint.current_limit) == (0, 0, 0, 0, 0)
 
 
-def test_identity_and_tare_write_no_set_point_either():
+def test_identity_and_tare_write_no_set_point():
     written = WrittenBytes()
     with FaultyEmulator(first_order_hand(forces=Stamps())) as emulator:
-        (found,) = find_hands(emulator.device, (0,), timing=PATIENT, open_port=written.open)
-        identity = identify(found, timing=PATIENT, open_port=written.open)
+        (device,) = find_hands(emulator.device, (0,), timing=PATIENT, open_port=written.open)
+        identity = identify(device, timing=PATIENT, open_port=written.open)
         assert (identity.version, identity.name, identity.side) == (b"tgdsl emulator", b"emulated", None)
         hand = XHand1.open(emulator.device, timing=PATIENT, open_port=written.open)
         tare = hand.tare(5)
@@ -97,7 +97,7 @@ def test_a_saturated_fingertip_cannot_be_tared():
 
 
 def failure_of(hand: XHand1) -> HandError | None:
-    """Return what a read says now, if it fails."""
+    """Return the error of a read, if it fails."""
     try:
         hand.read()
     except HandError as error:
@@ -105,8 +105,7 @@ def failure_of(hand: XHand1) -> HandError | None:
     return None
 
 
-def test_all_faults_at_once():
-    """What comes is new and whole, and what does not come has a name."""
+def test_under_all_faults_readings_stay_new_and_errors_named():
     stamps, readings, errors = Stamps(), [], []
     with FaultyEmulator(first_order_hand(forces=stamps), seed=5) as emulator, open_again(emulator.device, timing=CALM) as hand:
         emulator.set_faults(Faults.each(0.05))
@@ -145,13 +144,13 @@ def refusal(device: str) -> str:
     return str(caught.value)
 
 
-def test_a_line_that_damages_everything():
+def test_a_line_that_damages_everything_is_an_error():
     timing = SerialTiming(reply_timeout_s=1.0, silence_s=0.1)
     with FaultyEmulator(faults=Faults(corrupt=1.0)) as emulator, pytest.raises(HandTimeoutError, match="came damaged"):
         XHand1.open(emulator.device, timing=timing)
 
 
-def test_unplug_and_replug():
+def test_a_replugged_hand_reconnects():
     stamps = Stamps()
     with FaultyEmulator(first_order_hand(forces=stamps)) as emulator, open_again(emulator.device, timing=CALM) as hand:
         for _ in range(3):
@@ -164,17 +163,17 @@ def test_unplug_and_replug():
         assert hand.num_reconnects == 3
 
 
-def test_the_wrong_hand():
+def test_a_hand_with_another_id_does_not_answer():
     with FaultyEmulator(first_order_hand(3)) as emulator:
         with pytest.raises(HandTimeoutError):
             XHand1.open(emulator.device)
         with XHand1.open(emulator.device, Addresses(3), timing=PATIENT) as hand:
             hand.read(20.0)
-        found = find_hands(emulator.device, (1, 3), timing=SerialTiming(reply_timeout_s=2.0, silence_s=1.0))
-    assert [(hand.addresses, hand.version) for hand in found] == [(Addresses(3, 0x83, 0xFE), b"tgdsl emulator")]
+        hands = find_hands(emulator.device, (1, 3), timing=SerialTiming(reply_timeout_s=2.0, silence_s=1.0))
+    assert [(hand.addresses, hand.version) for hand in hands] == [(Addresses(3, 0x83, 0xFE), b"tgdsl emulator")]
 
 
-def test_a_closed_hand_says_so():
+def test_a_closed_hand_raises():
     with FaultyEmulator() as emulator:
         hand = XHand1.open(emulator.device, timing=PATIENT)
         hand.close()
@@ -184,7 +183,7 @@ def test_a_closed_hand_says_so():
                 call()
 
 
-def test_a_port_that_is_not_there_or_taken():
+def test_a_missing_or_busy_port_is_an_error():
     with pytest.raises(HandDisconnectedError, match="/dev/no-such-port cannot be opened at 3000000 baud"):
         XHand1.open("/dev/no-such-port")
     taken = pytest.raises(HandDisconnectedError, match="cannot be opened")
@@ -202,8 +201,8 @@ def test_ports_are_listed():
     assert all(isinstance(port, client.PortInfo) for port in client.list_ports())
 
 
-def test_only_one_file_knows_pyserial_and_only_in_a_function():
+def test_only_one_file_imports_pyserial_and_only_in_a_function():
     folder = Path(client.__file__).parents[2]
-    found = {file.name for file in folder.rglob("*.py") if "import serial" in file.read_text(encoding="utf-8")}
-    assert found == {"client.py"}
+    names = {file.name for file in folder.rglob("*.py") if "import serial" in file.read_text(encoding="utf-8")}
+    assert names == {"client.py"}
     assert "\nimport serial" not in Path(client.__file__).read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Motion limits: set-points against what the limits say, and an emulated hand that must become passive."""
+"""Motion limits: set-points against the limits, and an emulated hand that must become passive."""
 
 import subprocess
 import sys
@@ -32,7 +32,7 @@ ZERO = np.zeros(12)
 
 
 CALM = SerialTiming(reply_timeout_s=0.5, silence_s=0.4)
-"""As patient as a failure of the line may be that is to be noticed before the watchdog bites, after 1 s."""
+"""The longest timing that still notices a failed line before the watchdog does, after 1 s."""
 
 
 def limits(speed: float = 1.0, watchdog_s: float = 0.1) -> MotionLimits:
@@ -47,12 +47,12 @@ def positions(motion: Motion, now: float) -> np.ndarray:
 def test_ranges_come_from_the_robot_file(name):
     model = mujoco.MjModel.from_xml_path(str(robot_names()[name]))
     assert np.abs(model.jnt_range[joint_ids(model)]) == pytest.approx(np.abs(np.array(RANGES)), abs=1e-9)
-    found = MotionLimits.of_robot(model, speed=0.5, current_limit=200, kp=80)
-    assert [found.lower, found.upper] == [tuple(model.jnt_range[joint_ids(model)][:, i]) for i in (0, 1)]
-    assert (found.speed, found.current_limit, found.watchdog_s) == ((0.5,) * 12, (200,) * 12, 0.1)
+    motion_limits = MotionLimits.of_robot(model, speed=0.5, current_limit=200, kp=80)
+    assert [motion_limits.lower, motion_limits.upper] == [tuple(model.jnt_range[joint_ids(model)][:, i]) for i in (0, 1)]
+    assert (motion_limits.speed, motion_limits.current_limit, motion_limits.watchdog_s) == ((0.5,) * 12, (200,) * 12, 0.1)
 
 
-def test_another_robot_has_no_such_joints():
+def test_a_robot_without_the_hands_joints_is_refused():
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     with pytest.raises(MotionError, match="is a whole hand: expected one joint with a range for each of thumb_bend_joint, "):
         model.jnt_range[joint_ids(model)]
@@ -62,7 +62,7 @@ def test_another_robot_has_no_such_joints():
         model.jnt_range[joint_ids(model)]
 
 
-def test_a_set_point_starts_where_the_joint_is_and_moves_at_its_speed():
+def test_a_set_point_starts_at_the_joint_and_moves_at_the_speed_limit():
     motion, target = Motion(limits(speed=0.5)), np.clip(REST + 0.1, LOWER, UPPER)
     assert motion.joints(9.0) == PASSIVE
     motion.command(target, 10.0, REST)
@@ -87,11 +87,11 @@ def test_no_set_point_moves_faster_or_further_than_its_limits(commands, start, s
     for target, elapsed in commands:
         motion.command(target, now, start)
         now += elapsed
-        found = positions(motion, now)
-        assert (np.abs(found - last) <= speed * min(elapsed, 0.05) + 1e-12).all()
-        assert (found >= np.minimum(LOWER, start)).all()
-        assert (found <= np.maximum(UPPER, start)).all()
-        last = found
+        set_points = positions(motion, now)
+        assert (np.abs(set_points - last) <= speed * min(elapsed, 0.05) + 1e-12).all()
+        assert (set_points >= np.minimum(LOWER, start)).all()
+        assert (set_points <= np.maximum(UPPER, start)).all()
+        last = set_points
 
 
 def test_the_watchdog_stops_and_only_resume_starts_again():
@@ -108,7 +108,7 @@ def test_the_watchdog_stops_and_only_resume_starts_again():
     assert positions(motion, 1.4) == pytest.approx(ZERO)
 
 
-def test_a_command_that_comes_too_late_is_refused_before_the_next_exchange():
+def test_a_late_command_is_refused_before_the_next_exchange():
     motion = Motion(limits())
     motion.command(REST, 1.0, REST)
     with pytest.raises(WatchdogError):
@@ -154,13 +154,13 @@ def test_without_a_reading_nothing_moves():
         ({"watchdog_s": 2.0}, "watchdog_s is 2, expected more than 0 and at most 1 s"),
     ],
 )
-def test_limits_that_limit_nothing_are_refused(wrong, message):
+def test_invalid_limits_are_refused(wrong, message):
     good = {"lower": LOWER, "upper": UPPER, "speed": (1.0,) * 12, "current_limit": (300,) * 12, "kp": 1}
     with pytest.raises(MotionError, match=message):
         MotionLimits(**(good | wrong))
 
 
-def test_leave_to_move_alone_moves_nothing():
+def test_motion_limits_without_commands_move_nothing():
     written = WrittenBytes()
     with (
         FaultyEmulator() as emulator,
@@ -173,27 +173,27 @@ def test_leave_to_move_alone_moves_nothing():
 
 
 def drive(hand: XHand1, emulator: FaultyEmulator) -> None:
-    """Command until the hand has been told to move."""
-    before = len(driven(emulator))
-    drive_until(hand, REST, lambda: len(driven(emulator)) > before)
+    """Command until a request drives the hand."""
+    before = len(drive_times(emulator))
+    drive_until(hand, REST, lambda: len(drive_times(emulator)) > before)
 
 
-def driven(emulator: FaultyEmulator) -> list[float]:
-    """Return when requests came that drive the hand [s]."""
+def drive_times(emulator: FaultyEmulator) -> list[float]:
+    """Return the times of requests that drive the hand [s]."""
     return [at for at, frame in list(emulator.requests) if frame.payload[14:16] == MODE_POSITION]
 
 
 def becomes_passive(emulator: FaultyEmulator) -> bool:
-    """Wait until the hand was last told to be passive, and is: a request is noted before it is obeyed."""
+    """Wait until the last request is passive and the hand is too: requests are recorded before they act."""
 
-    def is_so() -> bool:
+    def is_passive() -> bool:
         last = list(emulator.requests)[-1][1]
         return last.payload[14:16] != MODE_POSITION and emulator.hand.is_passive
 
-    return wait_until(is_so)
+    return wait_until(is_passive)
 
 
-def test_an_emulated_hand_goes_where_it_is_told_and_close_makes_it_passive():
+def test_an_emulated_hand_reaches_its_target_and_close_makes_it_passive():
     with FaultyEmulator(first_order_hand(time_constant_s=0.02)) as emulator:
         with XHand1.open(emulator.device, timing=PATIENT, motion=limits(speed=5.0, watchdog_s=1.0)) as hand:
             assert emulator.hand.is_passive
@@ -217,8 +217,8 @@ def test_a_policy_that_stalls_leaves_the_hand_passive():
 
 
 @pytest.mark.parametrize("faults", [Faults(corrupt=1.0), Faults(drop=1.0), Faults(truncate=1.0)])
-def test_a_failure_on_the_line_leaves_the_hand_passive_although_no_reply_is_understood(faults):
-    """The watchdog may be first where the machine stands still: in virtual time it is the failure."""
+def test_a_failed_line_leaves_the_hand_passive(faults):
+    """On a busy machine the watchdog may come first; `test_virtual.py` tests the failure in virtual time."""
     with FaultyEmulator() as emulator, open_again(emulator.device, timing=CALM, motion=limits(watchdog_s=1.0)) as hand:
         drive(hand, emulator)
         emulator.set_faults(faults)
@@ -229,7 +229,7 @@ def test_a_failure_on_the_line_leaves_the_hand_passive_although_no_reply_is_unde
         emulator.set_faults(Faults())
 
 
-def test_a_hand_that_was_unplugged_while_it_moved_is_passive_when_it_is_back():
+def test_a_hand_unplugged_in_motion_is_passive_when_replugged():
     stamps = Stamps()
     with (
         FaultyEmulator(first_order_hand(forces=stamps)) as emulator,
@@ -256,7 +256,7 @@ def test_a_target_outside_its_range_leaves_the_hand_passive():
             hand.resume()
 
 
-def test_a_reader_that_fails_for_a_reason_of_its_own_leaves_the_hand_passive(monkeypatch):
+def test_a_bug_in_the_reader_leaves_the_hand_passive(monkeypatch):
     def broken(payload):
         raise ValueError("a mistake of ours")
 
@@ -290,9 +290,9 @@ raise RuntimeError("a policy that fails")
 """
 
 
-def test_a_program_that_fails_without_closing_leaves_the_hand_passive():
+def test_a_crashing_program_leaves_the_hand_passive():
     with FaultyEmulator() as emulator:
         run = subprocess.run([sys.executable, "-c", SCRIPT, emulator.device], capture_output=True, text=True)
         assert "a policy that fails" in run.stderr
-        assert driven(emulator)
+        assert drive_times(emulator)
         assert becomes_passive(emulator)

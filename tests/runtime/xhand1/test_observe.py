@@ -1,4 +1,4 @@
-"""Observations of a hand: against plain NumPy, and against the module's own of the same forces."""
+"""Observations of a hand, against plain NumPy and against the module's observations of the same forces."""
 
 import numpy as np
 import pytest
@@ -53,8 +53,8 @@ def compiled(tmp_path, terms, xml=None, dtype=torch.float32, side="right", **sen
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("side", ["right", "left"])
-def test_aggregates_stand_where_the_module_puts_them(tmp_path, dtype, side):
-    """The robot's bodies are in another order than the hand's fingers, and so are the features."""
+def test_aggregates_have_the_modules_order(tmp_path, dtype, side):
+    """The robot's bodies, and so the features, are in another order than the hand's fingers."""
     tips = ("pinky_link2", "thumb_rota_link2", "ring_link2", "index_rota_link2", "mid_link2")
     fingers = [4, 0, 3, 1, 2]
     terms = [*AGGREGATES, {"type": "agg_bool", "of": "contact"}]
@@ -62,45 +62,53 @@ def test_aggregates_stand_where_the_module_puts_them(tmp_path, dtype, side):
     total = np.random.default_rng(0).integers(-120, 120, (5, 3)).astype(np.int16)
     total[:, 2] = abs(total[:, 2])
     threshold = float(np.median(np.linalg.norm(total, axis=1))) + 0.5
-    found = HandObserver(touch, calibrated(threshold), 0.02).observe(sample(total))["policy"]
+    features = HandObserver(touch, calibrated(threshold), 0.02).observe(sample(total))["policy"]
     by_link = total[fingers].astype(np.float64)
     expected = [by_link[:, axis] for axis in (2, 1, 0)] + [by_link[:, axis] for axis in (0, 1, 2)]
     expected.append(np.linalg.norm(by_link, axis=1) > threshold)
-    np.testing.assert_array_equal(found[0].numpy(), np.concatenate(expected))
-    own = touch.observe(touch(touch.example_state(1)))["policy"]
-    assert (found.shape, found.dtype, found.device) == (own.shape, own.dtype, own.device)
+    np.testing.assert_array_equal(features[0].numpy(), np.concatenate(expected))
+    expected_features = touch.observe(touch(touch.example_state(1)))["policy"]
+    assert (features.shape, features.dtype, features.device) == (
+        expected_features.shape,
+        expected_features.dtype,
+        expected_features.device,
+    )
 
 
-def test_aggregates_of_the_same_forces_are_the_modules(tmp_path):
-    """Depths give the module's forces; a hand whose fingertips feel these is observed as the module is."""
+def test_aggregates_of_the_same_forces_match_the_modules(tmp_path):
+    """Depths give the module's forces; a hand with these forces on its fingertips has equal observations."""
     touch = compiled(tmp_path, AGGREGATES[:2], dtype=torch.float64)
     readings = touch(touch.example_state(1))
     readings["depth"] = torch.rand(readings["depth"].shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     normals = touch.taxels["depth"]["normal"]
     per_link = np.einsum("lj,ljk->lk", readings["depth"].numpy().reshape(5, -1), np.asarray(normals).reshape(5, -1, 3))
     exact = Calibration("N", np.full((5, 3), 1e4), PLAIN.rotation, 1e4 * per_link, PLAIN.tare)
-    found = HandObserver(touch, exact, 0.02).observe(sample(calibration=exact))
-    np.testing.assert_allclose(found["policy"].numpy(), touch.observe(readings)["policy"].numpy(), rtol=1e-6)
+    groups = HandObserver(touch, exact, 0.02).observe(sample(calibration=exact))
+    np.testing.assert_allclose(groups["policy"].numpy(), touch.observe(readings)["policy"].numpy(), rtol=1e-6)
 
 
-def test_groups_are_the_documents(tmp_path):
+def test_groups_match_the_document(tmp_path):
     groups = {"policy": AGGREGATES[:1], "blind": [{"type": "none"}], "critic": [{"type": "taxel_saturated"}, *AGGREGATES[2:]]}
     touch = tgdsl.compile(document(tmp_path, groups))
-    found = HandObserver(touch, PLAIN, 0.02).observe(sample())
-    assert {name: tuple(part.shape) for name, part in found.items()} == {"policy": (1, 15), "blind": (1, 0), "critic": (1, 615)}
-    assert list(found) == list(groups)
+    observations = HandObserver(touch, PLAIN, 0.02).observe(sample())
+    assert {name: tuple(part.shape) for name, part in observations.items()} == {
+        "policy": (1, 15),
+        "blind": (1, 0),
+        "critic": (1, 615),
+    }
+    assert list(observations) == list(groups)
 
 
-def test_taxels_are_axis_by_axis_then_finger_by_finger(tmp_path):
+def test_taxels_are_ordered_by_axis_then_by_finger(tmp_path):
     touch = compiled(tmp_path, [{"type": "taxel_counts"}, {"type": "taxel_saturated"}])
     taxel = np.random.default_rng(0).integers(-100, 100, (5, 120, 3)).astype(np.int16)
     taxel[:, :, 2] = abs(taxel[:, :, 2])
     taxel[1, 7, 0], taxel[3, 119, 1], taxel[4, 0, 2] = 127, -128, 255
-    found = HandObserver(touch, PLAIN, 0.02).observe(sample(taxel=taxel))["policy"][0]
-    assert found.dtype == torch.float32
+    features = HandObserver(touch, PLAIN, 0.02).observe(sample(taxel=taxel))["policy"][0]
+    assert features.dtype == torch.float32
     counts = [taxel[finger, i, axis] for axis in range(3) for finger in range(5) for i in range(120)]
-    np.testing.assert_array_equal(found[:1800].numpy(), counts)
-    assert torch.nonzero(found[1800:]).flatten().tolist() == [1 * 120 + 7, 3 * 120 + 119, 4 * 120]
+    np.testing.assert_array_equal(features[:1800].numpy(), counts)
+    assert torch.nonzero(features[1800:]).flatten().tolist() == [1 * 120 + 7, 3 * 120 + 119, 4 * 120]
 
 
 @pytest.mark.parametrize(
@@ -114,8 +122,8 @@ def test_taxels_are_axis_by_axis_then_finger_by_finger(tmp_path):
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*it takes a sample at every call")
-def test_rate_and_history_are_kept_as_the_module_keeps_them(tmp_path, fields):
-    """One module with them, one without; the hand feels at each step what the latter reads, twice with a reset between."""
+def test_rate_and_history_match_the_module(tmp_path, fields):
+    """The hand feels at each step what a module without rate and history reads; a reset separates two episodes."""
     plain = compiled(tmp_path, AGGREGATES[:1])
     touch = compiled(tmp_path, AGGREGATES[:1], depth=fields)
     step = 0.02
@@ -129,12 +137,12 @@ def test_rate_and_history_are_kept_as_the_module_keeps_them(tmp_path, fields):
         by_axis = plain.observe(plain(scene))["policy"].reshape(3, 5)
         force = by_axis.T.flip(1).double().numpy()
         exact = Calibration("N", PLAIN.scale, PLAIN.rotation, force, PLAIN.tare)
-        found = observer.observe(sample(calibration=exact))["policy"]
-        torch.testing.assert_close(found, touch.observe(touch(scene))["policy"], rtol=1e-6, atol=0)
+        features = observer.observe(sample(calibration=exact))["policy"]
+        torch.testing.assert_close(features, touch.observe(touch(scene))["policy"], rtol=1e-6, atol=0)
     assert force.any()
 
 
-def test_what_a_hand_cannot_give_is_listed_at_once(tmp_path):
+def test_all_unavailable_terms_are_listed_in_one_error(tmp_path):
     terms = [
         {"type": "none"},
         {"type": "depth", "of": "depth"},
@@ -185,7 +193,7 @@ def test_fingertips_by_body(body, finger):
     assert finger_of(body) == finger
 
 
-def test_noise_is_said_not_to_apply(tmp_path):
+def test_a_warning_says_that_noise_does_not_apply(tmp_path):
     warn_of_noise(compiled(tmp_path, AGGREGATES[:1]).plan)
     noisy = compiled(tmp_path, AGGREGATES[:1], depth={"noise": "noisy"})
     with pytest.warns(UserWarning, match="the noise of depth is simulated: it is not added to a hand's values"):
@@ -193,7 +201,7 @@ def test_noise_is_said_not_to_apply(tmp_path):
 
 
 @pytest.mark.parametrize("type_", ["taxel_counts", "taxel_saturated"])
-def test_a_simulation_has_no_such_taxels(tmp_path, type_):
+def test_a_simulation_cannot_give_a_hands_taxels(tmp_path, type_):
     touch = compiled(tmp_path, [{"type": "none"}, {"type": type_}])
     message = rf'observation policy\[1\] is "{type_}", which only a real XHand1 has, and no simulation'
     with pytest.raises(ObservationError, match=message):
@@ -204,7 +212,7 @@ def test_a_simulation_has_no_such_taxels(tmp_path, type_):
         tgdsl.connect(touch, "emulator")
 
 
-def test_the_plan_counts_their_features(tmp_path):
+def test_the_plan_counts_the_features_of_taxel_terms(tmp_path):
     touch = compiled(tmp_path, [{"type": "taxel_counts"}, {"type": "taxel_saturated"}, *AGGREGATES])
     assert [term.num_features for term in touch.plan.observations] == [1800, 600, 15, 0, 15]
     assert [term.axes for term in touch.plan.observations] == ["", "", "zyx", "", "xyz"]

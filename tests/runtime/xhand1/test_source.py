@@ -1,4 +1,4 @@
-"""The hand as a source: the speed filter against closed forms, and features against the observations of simulations."""
+"""The hand as a source: the velocity filter against closed forms, samples, and timing of steps."""
 
 import time
 
@@ -26,39 +26,39 @@ def pressed(time_s, position):
     return TipForces(TIPS.astype(np.float64), np.ones((5, 120, 3)))
 
 
-def test_an_even_motion():
-    speeds = VelocityFilter(0.05)
+def test_the_filter_of_a_steady_motion_has_a_closed_form():
+    velocity_filter = VelocityFilter(0.05)
     for n in range(40):
-        found = speeds.update(100 + 0.01 * n, np.array([0.3 * 0.01 * n, -2 * 0.01 * n]))
-        assert found == pytest.approx(np.array([0.3, -2]) * (1 - np.exp(-0.01 * n / 0.05)), abs=1e-9)
+        speed = velocity_filter.update(100 + 0.01 * n, np.array([0.3 * 0.01 * n, -2 * 0.01 * n]))
+        assert speed == pytest.approx(np.array([0.3, -2]) * (1 - np.exp(-0.01 * n / 0.05)), abs=1e-9)
 
 
-def test_uneven_times_count():
-    speeds, times = VelocityFilter(0.05), np.cumsum(np.random.default_rng(0).uniform(0.001, 0.01, 30))
-    found = [speeds.update(now, np.array([1.5 * now]))[0] for now in times]
-    assert found == pytest.approx(1.5 * (1 - np.exp(-(times - times[0]) / 0.05)), abs=1e-9)
+def test_the_filter_takes_uneven_times_into_account():
+    velocity_filter, times = VelocityFilter(0.05), np.cumsum(np.random.default_rng(0).uniform(0.001, 0.01, 30))
+    filtered = [velocity_filter.update(now, np.array([1.5 * now]))[0] for now in times]
+    assert filtered == pytest.approx(1.5 * (1 - np.exp(-(times - times[0]) / 0.05)), abs=1e-9)
 
 
-def test_a_sine_is_damped_and_late_as_a_first_order_filter_does():
+def test_the_filter_damps_and_delays_a_sine_to_first_order():
     omega, tau, times = 20.0, 0.03, np.arange(0, 2, 1e-4)
-    speeds = VelocityFilter(tau)
-    found = np.array([speeds.update(t, np.array([np.sin(omega * t)]))[0] for t in times])
+    velocity_filter = VelocityFilter(tau)
+    filtered = np.array([velocity_filter.update(t, np.array([np.sin(omega * t)]))[0] for t in times])
     gain, lag = 1 / np.hypot(1, omega * tau), np.arctan(omega * tau)
     expected = omega * gain * np.cos(omega * times - lag)
-    assert found[times > 1] == pytest.approx(expected[times > 1], abs=2e-3 * omega)
+    assert filtered[times > 1] == pytest.approx(expected[times > 1], abs=2e-3 * omega)
 
 
-def test_plain_differences_the_first_reading_and_one_that_is_not_later():
-    speeds = VelocityFilter(0.0)
-    assert speeds.update(1.0, np.array([5.0])) == [0.0]
-    assert speeds.update(1.5, np.array([6.0])) == [2.0]
-    assert speeds.update(1.5, np.array([9.0])) == [2.0]
-    assert speeds.update(2.0, np.array([6.0])) == [0.0]
-    speeds.reset()
-    assert speeds.update(0.0, np.array([1.0])) == [0.0]
+def test_without_a_time_constant_velocities_are_differences():
+    velocity_filter = VelocityFilter(0.0)
+    assert velocity_filter.update(1.0, np.array([5.0])) == [0.0]
+    assert velocity_filter.update(1.5, np.array([6.0])) == [2.0]
+    assert velocity_filter.update(1.5, np.array([9.0])) == [2.0]
+    assert velocity_filter.update(2.0, np.array([6.0])) == [0.0]
+    velocity_filter.reset()
+    assert velocity_filter.update(0.0, np.array([1.0])) == [0.0]
 
 
-def test_a_sample_and_its_features():
+def test_a_sample_has_calibrated_forces_and_saturation():
     newton = Calibration("N", np.full((5, 3), 0.1), np.tile(np.eye(3), (5, 1, 1)), np.zeros((5, 3)), np.zeros((5, 3)))
     with Emulator(first_order_hand(forces=pressed)) as emulator, XHand1.open(emulator.device, **CALM) as hand:
         source: Source = XHand1Source(hand, control_step=0.02, calibration=newton, read_timeout_s=20.0)
@@ -75,7 +75,7 @@ def test_a_sample_and_its_features():
     assert not sample.joint_error.any()
 
 
-def test_steps_keep_their_time_and_late_ones_are_counted(monkeypatch):
+def test_steps_keep_their_period_and_late_ones_are_counted(monkeypatch):
     with virtual_hand(monkeypatch) as (hand, _, clock):
         start, ends = clock.now, []
         source = XHand1Source(hand, control_step=0.04)
@@ -91,7 +91,7 @@ def test_steps_keep_their_time_and_late_ones_are_counted(monkeypatch):
         assert (clock.now - start, source.num_late_steps) == (pytest.approx(1.58), 2)
 
 
-def test_each_step_gives_a_new_reading_and_no_sooner():
+def test_each_step_waits_for_a_new_reading():
     with Emulator() as emulator, XHand1.open(emulator.device, **CALM) as hand:
         start, sequences = time.monotonic(), []
         source = XHand1Source(hand, control_step=0.04, read_timeout_s=20.0)
@@ -125,7 +125,7 @@ def test_controls_are_joint_angles():
             try:
                 source.step(target[None])
                 source.step()
-            except WatchdogError:  # the machine stood still
+            except WatchdogError:  # the machine was too busy
                 hand.resume()
                 return False
             return abs(source.sample().joint_pos[0] - target).max() < 0.01

@@ -43,9 +43,9 @@ def test_joints_follow_first_order_and_stay_when_passive():
     for after in (0.01, 0.05, 0.2):
         expected = 0.1 * np.arange(12) * (1 - math.exp(-after / 0.05))
         assert ask(hand, 10.0 + after, MOVING).position == pytest.approx(expected, abs=1e-6)
-    held = hand.position
+    position = hand.position
     ask(hand, 10.2, PASSIVE)
-    assert ask(hand, 60.0, PASSIVE).position == pytest.approx(held, abs=1e-6)
+    assert ask(hand, 60.0, PASSIVE).position == pytest.approx(position, abs=1e-6)
     assert hand.is_passive
 
 
@@ -57,7 +57,7 @@ def test_a_joint_without_mode_gain_or_current_stays(lacking):
     assert (ask(hand, 2.0, [joint] * 12).position == 0).all()
 
 
-def test_fingertips_feel_the_field_rounded_and_cut_to_a_byte():
+def test_fingertip_forces_are_rounded_and_clipped_to_a_byte():
     def field(time_s, position):
         taxel = np.zeros((5, 120, 3))
         taxel[1, 7] = [-300, 300, -5]
@@ -69,7 +69,7 @@ def test_fingertips_feel_the_field_rounded_and_cut_to_a_byte():
     assert np.count_nonzero(state.taxel_force) == 2
 
 
-def test_what_a_hand_does_not_know_it_refuses_and_what_is_for_others_it_ignores():
+def test_unknown_commands_are_refused_and_other_addresses_ignored():
     hand = first_order_hand(2)
     assert hand.answer(Frame(0xFE, 0x80, Command.VERSION), 0.0) is None
     assert hand.answer(Frame(0xFE, 0x82, Command.RESET), 0.0) == Frame(0x82, 0xFE, 0, b"\x14")
@@ -77,25 +77,25 @@ def test_what_a_hand_does_not_know_it_refuses_and_what_is_for_others_it_ignores(
     assert hand.answer(Frame(0xFE, 0x82, Command.READ_REGISTER, b"\x35\x00"), 0.0) == Frame(0x82, 0xFE, 0x15, b"\x02")
 
 
-def test_bytes_take_their_time_and_follow_one_another():
-    """They come out as at the far end of an adapter: 124 at a time, whatever frame they are of, and the rest at the end."""
+def test_bytes_come_at_the_lines_rate_one_after_another():
+    """As from a USB adapter: in chunks of 124 bytes across frames, and the rest at the end."""
     line, byte, both = EmulatedLine(first_order_hand()), 10 / BAUD, b"a" * 2217 + b"b" * 297
     line.send(both[:2217], 5.0)
     line.send(both[2217:], 5.001)
-    out = b""
+    received = b""
     for num_chunks in (1, 17, 18, 20):
         end = 5.0 + 124 * num_chunks * byte
-        out += line.due(end - 1e-6)
-        assert len(out) == 124 * (num_chunks - 1)
-        out += line.due(end + 1e-9)
-        assert out == both[: 124 * num_chunks]
+        received += line.due(end - 1e-6)
+        assert len(received) == 124 * (num_chunks - 1)
+        received += line.due(end + 1e-9)
+        assert received == both[: 124 * num_chunks]
     assert line.due(5.0 + 2514 * byte - 1e-6) == b""
     assert line.next_due() == pytest.approx(5.0 + 2514 * byte)
     assert line.due(10.0) == both[20 * 124 :]
     assert line.next_due() is None
 
 
-def test_after_a_pause_the_line_starts_anew():
+def test_after_a_pause_the_line_restarts():
     line = EmulatedLine(first_order_hand())
     line.send(b"a" * 100, 5.0)
     line.send(b"b" * 100, 6.0)
@@ -111,19 +111,19 @@ REPLY, OTHER = encode_frame(Frame(0x80, 0xFE, 2, bytes(50))), encode_frame(Frame
     ("fault", "frames"),
     [("corrupt", 0), ("truncate", 0), ("drop", 0), ("delay", 1), ("duplicate", 2), ("noise", 1), ("foreign", 2)],
 )
-def test_each_fault_does_what_it_says(fault, frames):
+def test_each_fault_has_its_effect(fault, frames):
     line = FaultyLine(faults=Faults(**{fault: 1.0}), seed=1)
     line.reply(REPLY, OTHER, 0.0)
     early, late = line.due(0.039), line.due(1.0)
     assert (late if fault == "delay" else early) == early + late
     parser = FrameParser()
-    found = parser.feed(early + late) + parser.flush()
-    assert len(found) == frames
-    assert [frame.source for frame in found] == ([0x81, 0x80] if fault == "foreign" else [0x80] * frames)
+    parsed = parser.feed(early + late) + parser.flush()
+    assert len(parsed) == frames
+    assert [frame.source for frame in parsed] == ([0x81, 0x80] if fault == "foreign" else [0x80] * frames)
     assert line.counts[fault] == 1
 
 
-def test_faults_are_as_frequent_as_they_say_and_the_same_for_a_seed():
+def test_faults_have_their_rate_and_repeat_for_a_seed():
     lines = [FaultyLine(faults=Faults.each(0.05), seed=4) for _ in range(2)]
     for line in lines:
         for _ in range(4000):
@@ -136,20 +136,20 @@ def test_faults_are_as_frequent_as_they_say_and_the_same_for_a_seed():
 
 
 def test_the_highest_rate_loses_nothing(capsys):
-    """The benchmark's own run, short; how even the readings come depends on the machine, and is printed."""
+    """A short run of the benchmark; the jitter of readings depends on the machine and is printed."""
     soak = runpy.run_path(str(Path(__file__).parents[4] / "benchmarks" / "hand_soak.py"))["soak"]
-    found = soak(5.0)
-    assert (found.num_lost, found.num_lost_bytes) == (0, 0)
-    counters = found.counters
+    report = soak(5.0)
+    assert (report.num_lost, report.num_lost_bytes) == (0, 0)
+    counters = report.counters
     assert (counters.num_timeouts, counters.num_damaged, counters.num_unexpected, counters.num_discarded_bytes) == (0, 0, 0, 0)
-    assert np.all(np.diff(found.received_at) > 0.97 * 2514 * 10 / BAUD)
-    assert "lost: 0 exchanges, 0 bytes" in found.text()
+    assert np.all(np.diff(report.received_at) > 0.97 * 2514 * 10 / BAUD)
+    assert "lost: 0 exchanges, 0 bytes" in report.text()
     with capsys.disabled():
-        print(f"\n{found.text()}")
+        print(f"\n{report.text()}")
 
 
-def test_a_thread_that_ends_says_so_to_who_waits(monkeypatch):
-    """A field of forces with a mistake: the port goes away, and whoever calls is told what happened, at once and again."""
+def test_an_error_in_the_emulators_thread_is_raised_by_every_call(monkeypatch):
+    """A bug in the force field removes the port; every later call raises the error."""
 
     def broken(time_s, position):
         raise ValueError("a mistake of ours")
@@ -166,7 +166,7 @@ def test_a_thread_that_ends_says_so_to_who_waits(monkeypatch):
     emulator.close()
 
 
-def test_a_mistake_in_the_line_ends_the_thread_and_calls_raise_it(monkeypatch):
+def test_a_bug_in_the_line_ends_the_thread_and_calls_raise_it(monkeypatch):
     emulator = FaultyEmulator()
 
     def broken(now):
@@ -179,7 +179,7 @@ def test_a_mistake_in_the_line_ends_the_thread_and_calls_raise_it(monkeypatch):
             call()
 
 
-def test_what_a_call_raises_is_raised_to_its_caller_and_the_hand_goes_on(monkeypatch):
+def test_an_error_of_a_call_is_raised_to_its_caller_and_the_hand_goes_on(monkeypatch):
     with FaultyEmulator() as emulator:
         emulator.unplug()
         with monkeypatch.context() as patched:

@@ -1,4 +1,4 @@
-"""The driver's promises in time, in virtual time: each holds for every call, whatever the machine does meanwhile."""
+"""The driver's time limits, in virtual time: each holds for every call, however busy the machine is."""
 
 import contextlib
 
@@ -23,7 +23,7 @@ from tgdsl.runtime.xhand1.wire.errors import (
 FAULTS = ["corrupt", "truncate", "drop", "delay", "duplicate", "noise", "foreign", "silence"]
 EXCHANGE_S = 2514 * 10 / 3e6
 LIMIT_S = 0.1
-"""Within this a reading or a named error must come [s]."""
+"""Longest time until a reading or a named error [s]."""
 MODE_POSITION = b"\x03\x00"
 REST = np.array([0.5, 0.2, 0.3, 0.0] + [0.6] * 8)
 
@@ -33,7 +33,7 @@ def limits(speed: float = 5.0, watchdog_s: float = 0.1) -> MotionLimits:
 
 
 def read_for(hand: XHand1, time: VirtualTime, stamps: Stamps, num_calls: int) -> tuple[list, list[HandError]]:
-    """Read; every call must end in time, in a new reading or a named error."""
+    """Read repeatedly; every call must end in time with a new reading or a named error."""
     readings, errors, fresh = [], [], []
     for _ in range(num_calls):
         start = time.now
@@ -51,7 +51,7 @@ def read_for(hand: XHand1, time: VirtualTime, stamps: Stamps, num_calls: int) ->
 
 
 def failure_of(hand: XHand1) -> HandError | None:
-    """Return what a read says now, if it fails."""
+    """Return the error of a read, if it fails."""
     try:
         hand.read()
     except HandError as error:
@@ -65,8 +65,8 @@ def drive(hand: XHand1, time: VirtualTime, seconds: float = 0.1) -> None:
         time.sleep(0.005)
 
 
-def driving(port: VirtualPort) -> list[float]:
-    """Return when requests that drive the hand were written [s]."""
+def drive_times(port: VirtualPort) -> list[float]:
+    """Return the times of requests that drive the hand [s]."""
     return [at for at, data in port.writes if data[21:23] == MODE_POSITION]
 
 
@@ -80,7 +80,7 @@ def test_readings_come_as_fast_as_the_line_carries_them(monkeypatch):
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_one_reply_in_twenty_is_faulty(fault, monkeypatch):
+def test_reads_survive_one_faulty_reply_in_twenty(fault, monkeypatch):
     stamps = Stamps()
     with virtual_hand(monkeypatch, first_order_hand(forces=stamps), seed=3) as (hand, port, time):
         hand.read()
@@ -91,8 +91,7 @@ def test_one_reply_in_twenty_is_faulty(fault, monkeypatch):
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_every_reply_is_faulty(fault, monkeypatch):
-    """A reading or a named error comes in time whatever the line does, call after call."""
+def test_reads_end_in_time_when_every_reply_is_faulty(fault, monkeypatch):
     with virtual_hand(monkeypatch, first_order_hand(forces=Stamps()), seed=3) as (hand, port, time):
         hand.read()
         port.set_faults(Faults(**{fault: 1.0}))
@@ -102,7 +101,7 @@ def test_every_reply_is_faulty(fault, monkeypatch):
             assert type(failure) is not HandError
 
 
-def test_half_a_minute_with_one_fault_of_each_kind_in_twenty(monkeypatch):
+def test_reads_survive_half_a_minute_of_all_faults(monkeypatch):
     stamps = Stamps()
     with virtual_hand(monkeypatch, first_order_hand(forces=stamps), seed=7) as (hand, port, time):
         hand.read()
@@ -113,12 +112,12 @@ def test_half_a_minute_with_one_fault_of_each_kind_in_twenty(monkeypatch):
             assert len(readings) > 300 and errors
 
 
-def test_a_silent_device_is_named_at_once_and_again(monkeypatch):
+def test_every_read_of_a_silent_device_raises_in_time(monkeypatch):
     stamps = Stamps()
     with virtual_hand(monkeypatch, first_order_hand(forces=stamps)) as (hand, port, time):
         hand.read()
         port.set_faults(Faults(silence=1.0))
-        with contextlib.suppress(HandError):  # what was under way
+        with contextlib.suppress(HandError):  # the exchange in progress
             hand.read()
         for _ in range(5):
             start = time.now
@@ -129,7 +128,7 @@ def test_a_silent_device_is_named_at_once_and_again(monkeypatch):
         stamps.check(hand.read(1.0), time.now)
 
 
-def test_a_pulled_cable_is_named_in_time_and_a_new_one_found(monkeypatch):
+def test_an_unplugged_hand_raises_in_time_and_reconnects(monkeypatch):
     stamps = Stamps()
     with virtual_hand(monkeypatch, first_order_hand(forces=stamps)) as (hand, port, time):
         for i in range(3):
@@ -145,7 +144,7 @@ def test_a_pulled_cable_is_named_in_time_and_a_new_one_found(monkeypatch):
             assert hand.num_reconnects == i + 1
 
 
-def test_a_slow_line_is_stale_by_name(monkeypatch):
+def test_a_slow_line_is_a_timeout_with_the_readings_age(monkeypatch):
     with virtual_hand(monkeypatch, timing=SerialTiming(reply_timeout_s=5.0), turnaround_s=0.3) as (hand, _, time):
         hand.read()
         with pytest.raises(HandTimeoutError, match="no new reading came in time; the newest is 310 ms old"):
@@ -155,8 +154,7 @@ def test_a_slow_line_is_stale_by_name(monkeypatch):
         assert time.now - start == pytest.approx(0.3 + EXCHANGE_S, abs=0.005)
 
 
-def test_a_reading_that_nobody_fetched_grows_stale(monkeypatch):
-    """What was new once is not handed out later as if it were."""
+def test_an_unfetched_reading_becomes_stale(monkeypatch):
     with virtual_hand(monkeypatch) as (hand, port, time):
         time.sleep(0.05)
         port.set_faults(Faults(silence=1.0))
@@ -166,14 +164,14 @@ def test_a_reading_that_nobody_fetched_grows_stale(monkeypatch):
 
 
 def test_a_call_waits_as_long_as_two_replies_may_take(monkeypatch):
-    """And a reading may be as old: where the line is given time, the caller gives it too."""
+    """A reading may be as old: a longer reply timeout also makes callers wait longer."""
     with virtual_hand(monkeypatch, timing=SerialTiming(reply_timeout_s=0.5), turnaround_s=0.4) as (hand, _, time):
         hand.read()
         for _ in range(3):
             assert hand.read().age_s(time.now) == pytest.approx(0.4 + EXCHANGE_S, abs=0.005)
 
 
-def test_a_hand_goes_where_it_is_told_and_close_makes_it_passive(monkeypatch):
+def test_a_hand_reaches_its_target_and_close_makes_it_passive(monkeypatch):
     emulated = first_order_hand(time_constant_s=0.02)
     with virtual_hand(monkeypatch, emulated, motion=limits()) as (hand, _, time):
         hand.read()
@@ -185,7 +183,7 @@ def test_a_hand_goes_where_it_is_told_and_close_makes_it_passive(monkeypatch):
 
 
 def test_a_policy_that_stalls_leaves_the_hand_passive(monkeypatch):
-    """Requests drive the hand for just the watchdog's time after the last command, and an exchange at most less."""
+    """Requests drive the hand for the watchdog's time after the last command, less one exchange at most."""
     emulated = first_order_hand()
     with virtual_hand(monkeypatch, emulated, motion=limits()) as (hand, port, time):
         hand.read()
@@ -194,12 +192,12 @@ def test_a_policy_that_stalls_leaves_the_hand_passive(monkeypatch):
             hand.command(REST)
             time.sleep(0.5)
             assert emulated.is_passive
-            assert 0.1 - EXCHANGE_S - 0.002 < driving(port)[-1] - commanded_at <= 0.1
+            assert 0.1 - EXCHANGE_S - 0.002 < drive_times(port)[-1] - commanded_at <= 0.1
             with pytest.raises(WatchdogError):
                 hand.command(REST)
-            held = emulated.position
+            position = emulated.position
             time.sleep(0.1)
-            assert (emulated.position == held).all()
+            assert (emulated.position == position).all()
             hand.resume()
             time.sleep(0.1)
             assert emulated.is_passive
@@ -214,7 +212,7 @@ def test_a_policy_that_stalls_leaves_the_hand_passive(monkeypatch):
         (Faults(silence=1.0), HandTimeoutError),
     ],
 )
-def test_a_failure_on_the_line_leaves_the_hand_passive_although_no_reply_is_understood(monkeypatch, faults, error):
+def test_a_failed_line_leaves_the_hand_passive(monkeypatch, faults, error):
     emulated = first_order_hand()
     with virtual_hand(monkeypatch, emulated, motion=limits(watchdog_s=1.0)) as (hand, port, time):
         hand.read()
@@ -222,7 +220,7 @@ def test_a_failure_on_the_line_leaves_the_hand_passive_although_no_reply_is_unde
         assert not emulated.is_passive
         port.set_faults(faults)
         time.sleep(LIMIT_S)
-        assert driving(port)[-1] < time.now - 0.03
+        assert drive_times(port)[-1] < time.now - 0.03
         assert emulated.is_passive or faults.silence
         with pytest.raises(error, match="the hand is passive"):
             hand.command(REST)
@@ -231,7 +229,7 @@ def test_a_failure_on_the_line_leaves_the_hand_passive_although_no_reply_is_unde
         assert emulated.is_passive
 
 
-def test_a_hand_that_was_unplugged_while_it_moved_is_passive_when_it_is_back(monkeypatch):
+def test_a_hand_unplugged_in_motion_is_passive_when_replugged(monkeypatch):
     stamps = Stamps()
     emulated = first_order_hand(forces=stamps)
     with virtual_hand(monkeypatch, emulated, motion=limits(watchdog_s=1.0)) as (hand, port, time):
@@ -262,7 +260,7 @@ def test_a_target_outside_its_range_leaves_the_hand_passive(monkeypatch):
             hand.resume()
 
 
-def test_close_says_if_the_hand_may_still_be_driven(monkeypatch):
+def test_close_raises_if_the_hand_may_still_be_driven(monkeypatch):
     def close_in_silence():
         with virtual_hand(monkeypatch, motion=limits()) as (hand, port, time):
             hand.read()

@@ -1,4 +1,4 @@
-"""Logs: what was written comes back bit for bit, or as an error that says what is wrong with the file."""
+"""Logs are read back bit for bit, or an error says what is wrong with the file."""
 
 import json
 import tracemalloc
@@ -24,18 +24,18 @@ IDENTITY = HandIdentity("/dev/ttyUSB7", 3, b"\x01\xff", None, b"SN-1\0\0", b"")
 
 @pytest.fixture(scope="module")
 def logged(tmp_path_factory):
-    """More readings than are in memory at a time, and their log."""
+    """Return readings of more than two chunks, and their log."""
     readings = random_readings(1e5 + 0.0084 * np.arange(2 * CHUNK + 7))
     return readings, write_log(tmp_path_factory.mktemp("log") / "hand.npz", readings)
 
 
-def test_readings_come_back_bit_for_bit(logged):
+def test_readings_round_trip_bit_for_bit(logged):
     readings, path = logged
     log = open_log(path)
-    found = list(log.readings())
-    assert log.num_readings == len(found) == len(readings)
-    for one, other in zip(found, readings, strict=True):
-        assert_same_reading(one, other)
+    loaded = list(log.readings())
+    assert log.num_readings == len(loaded) == len(readings)
+    for reading, expected in zip(loaded, readings, strict=True):
+        assert_same_reading(reading, expected)
     assert log.seconds == pytest.approx(0.0084 * (len(readings) - 1))
     assert log.faults == ()
     assert (log.identity, log.calibration) == (None, None)
@@ -52,12 +52,12 @@ def test_a_log_is_plain_numpy(logged):
 
 
 def test_a_record_holds_every_byte_of_the_wire():
-    """Forces take two bytes here and one on the wire; all else takes what it takes there."""
+    """Forces take two bytes here and one on the wire; all other fields have the wire's size."""
     wide = sum(RECORD[name].itemsize // 2 for name in ("total_force", "taxel_force"))
     assert sum(RECORD[name].itemsize for name in STATE) - wide == STATE_SIZE
 
 
-def test_whose_and_what_and_what_went_wrong(tmp_path):
+def test_identity_calibration_and_faults_round_trip(tmp_path):
     rng = np.random.default_rng(1)
     rotation = np.linalg.qr(rng.normal(size=(5, 3, 3)))[0]
     calibration = Calibration(
@@ -81,15 +81,15 @@ def test_whose_and_what_and_what_went_wrong(tmp_path):
 @pytest.mark.parametrize(
     ("kind", "says"), [("NewError", "NewError: x"), ("TgdslError", "TgdslError: x"), ("annotations", "annotations: x")]
 )
-def test_a_failure_of_a_class_that_is_not_known_here(kind, says):
-    found = Fault(0.0, kind, "x").error()
-    assert (type(found), str(found)) == (HandError, says)
+def test_a_fault_of_an_unknown_class_is_a_hand_error(kind, says):
+    error = Fault(0.0, kind, "x").error()
+    assert (type(error), str(error)) == (HandError, says)
 
 
 # writing
 
 
-def test_a_log_appears_whole_and_at_the_end(tmp_path):
+def test_a_log_replaces_the_file_when_it_is_closed(tmp_path):
     path, readings = tmp_path / "a.npz", random_readings(np.array([1.0, 1.1]))
     path.write_text("older")
     with LogWriter(path) as log:
@@ -102,7 +102,7 @@ def test_a_log_appears_whole_and_at_the_end(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["a.npz"]
 
 
-def test_what_came_before_a_failure_is_kept(tmp_path):
+def test_readings_before_an_exception_are_kept(tmp_path):
     def fail(path, readings) -> None:
         with LogWriter(path) as log:
             for reading in readings:
@@ -117,7 +117,7 @@ def test_what_came_before_a_failure_is_kept(tmp_path):
     assert not (tmp_path / "b.npz").exists()
 
 
-def test_an_empty_log_and_a_disk_that_fails_leave_nothing(tmp_path, monkeypatch):
+def test_an_empty_log_or_a_full_disk_leaves_no_file(tmp_path, monkeypatch):
     with pytest.raises(LogError, match="not one reading came, so nothing was written"), LogWriter(tmp_path / "a.npz") as log:
         log.add(Fault(1.0, "HandTimeoutError", "x"))
     monkeypatch.setattr("os.fsync", lambda file: (_ for _ in ()).throw(OSError(28, "No space left on device")))
@@ -127,59 +127,59 @@ def test_an_empty_log_and_a_disk_that_fails_leave_nothing(tmp_path, monkeypatch)
 
 
 def test_a_long_log_takes_little_memory(tmp_path):
-    """60 MB of readings; what is in memory at a time is NumPy's buffer of 16 MB, as it is and as bytes."""
+    """60 MB of readings; memory holds NumPy's buffer of 16 MB twice, as an array and as bytes."""
     reading = random_readings(np.array([1.0]))[0]
     tracemalloc.start()
     try:
         with LogWriter(tmp_path / "a.npz") as log:
             for i in range(15_000):
                 log.add(Reading(i, 0.01 * i, 0.01 * i, reading.state))
-        found = sum(1 for _ in open_log(tmp_path / "a.npz").readings())
+        num_readings = sum(1 for _ in open_log(tmp_path / "a.npz").readings())
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert found == 15_000
+    assert num_readings == 15_000
     assert peak < 40e6
 
 
-# files that are not what they should be
+# invalid files
 
 
-def small(tmp_path) -> bytes:
+def small_log(tmp_path) -> bytes:
     return write_log(
         tmp_path / "small.npz", random_readings(np.array([1.0, 1.1, 1.2])), (Fault(1.15, "HandError", "x"),)
     ).read_bytes()
 
 
-def test_a_log_that_was_cut(tmp_path):
-    whole = small(tmp_path)
+def test_a_truncated_log_is_refused(tmp_path):
+    whole = small_log(tmp_path)
     for end in [0, 1, 10, *range(100, len(whole), 997), len(whole) - 1]:
         (tmp_path / "cut.npz").write_bytes(whole[:end])
         with pytest.raises(LogError, match=r"cut\.npz: this log is damaged, cut, or no \.npz file: "):
             open_log(tmp_path / "cut.npz")
 
 
-def test_a_changed_byte_is_seen_or_means_nothing(tmp_path):
-    whole, expected, rng = bytearray(small(tmp_path)), random_readings(np.array([1.0, 1.1, 1.2])), np.random.default_rng(3)
-    refused = 0
+def test_a_changed_byte_is_detected_or_harmless(tmp_path):
+    whole, expected, rng = bytearray(small_log(tmp_path)), random_readings(np.array([1.0, 1.1, 1.2])), np.random.default_rng(3)
+    num_refused = 0
     for place in rng.choice(len(whole), 400, replace=False):
-        before = whole[place]
+        byte = whole[place]
         whole[place] ^= int(rng.integers(1, 256))
         (tmp_path / "changed.npz").write_bytes(whole)
-        whole[place] = before
+        whole[place] = byte
         try:
-            found = list(open_log(tmp_path / "changed.npz").readings())
+            readings = list(open_log(tmp_path / "changed.npz").readings())
         except LogError:
-            refused += 1
+            num_refused += 1
             continue
-        for one, other in zip(found, expected, strict=True):
-            assert_same_reading(one, other)
-    assert refused > 300
+        for reading, expected_reading in zip(readings, expected, strict=True):
+            assert_same_reading(reading, expected_reading)
+    assert num_refused > 300
 
 
-def rewritten(tmp_path, name: str, change) -> LogError:
-    """Return what is said of a log in which one array was changed."""
-    small(tmp_path)
+def error_of(tmp_path, name: str, change) -> LogError:
+    """Return the error for a log with one changed array."""
+    small_log(tmp_path)
     with np.load(tmp_path / "small.npz") as archive:
         arrays = dict(archive)
     changed = change(arrays[name])
@@ -203,11 +203,11 @@ def rewritten(tmp_path, name: str, change) -> LogError:
         ("fault_kind", lambda a: a[:0], "damaged"),
     ],
 )  # fmt: skip
-def test_arrays_that_are_not_a_log_s(tmp_path, name, change, says):
-    assert says in str(rewritten(tmp_path, name, change))
+def test_invalid_arrays_are_refused(tmp_path, name, change, says):
+    assert says in str(error_of(tmp_path, name, change))
 
 
-def test_files_that_are_no_logs(tmp_path):
+def test_files_that_are_not_logs_are_refused(tmp_path):
     with pytest.raises(LogError, match=r"none\.npz: cannot read this log: No such file or directory"):
         open_log(tmp_path / "none.npz")
     with pytest.raises(LogError, match="cannot read this log: Is a directory"):
@@ -217,7 +217,7 @@ def test_files_that_are_no_logs(tmp_path):
         open_log(tmp_path / "text.npz")
 
 
-def test_recording_an_emulated_hand_through_failures(tmp_path):
+def test_a_recording_goes_on_after_failures(tmp_path):
     stamps = Stamps()
     with (
         FaultyEmulator(first_order_hand(forces=stamps)) as emulator,
@@ -235,9 +235,9 @@ def test_recording_an_emulated_hand_through_failures(tmp_path):
             if num_more == 20:
                 break
     log = open_log(tmp_path / "a.npz")
-    found = [stamps.check(reading) for reading in log.readings()]
-    assert len(found) > 20  # a busy machine may have lost one before the thirtieth
-    assert all(one < other for one, other in pairwise(found))
+    times = [stamps.check(reading) for reading in log.readings()]
+    assert len(times) > 20  # a busy machine may have lost one before the thirtieth
+    assert all(earlier < later for earlier, later in pairwise(times))
     assert log.faults
     assert all(isinstance(fault.error(), HandTimeoutError) for fault in log.faults)
     assert log.received_at[0] < log.faults[0].time < log.received_at[-1]
@@ -246,9 +246,9 @@ def test_recording_an_emulated_hand_through_failures(tmp_path):
 def test_a_closed_hand_ends_a_recording():
     with FaultyEmulator() as emulator:
         hand = XHand1.open(emulator.device)
-        coming = events(hand, 60.0)
-        next(coming)
+        stream = events(hand, 60.0)
+        next(stream)
         hand.close()
         with pytest.raises(HandClosedError):
-            for _ in coming:
+            for _ in stream:
                 pass

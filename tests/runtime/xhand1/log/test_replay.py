@@ -1,4 +1,4 @@
-"""Recorded hands as sources: the very samples that were live, at the times at which they would have come."""
+"""Recorded hands as sources: the same samples as live, at the same times."""
 
 import math
 import time
@@ -32,9 +32,9 @@ NEWTON = Calibration(
 LIMITS = MotionLimits((0.0,) * 12, (1.0,) * 12, (10.0,) * 12, (300,) * 12, kp=100, watchdog_s=1.0)
 
 
-def assert_same_sample(found: HandSample, expected: HandSample) -> None:
+def assert_same_sample(sample: HandSample, expected: HandSample) -> None:
     for field in fields(HandSample):
-        a, b = getattr(found, field.name), getattr(expected, field.name)
+        a, b = getattr(sample, field.name), getattr(expected, field.name)
         if isinstance(b, torch.Tensor):
             assert a.dtype == b.dtype
             assert torch.equal(a, b), field.name
@@ -51,7 +51,7 @@ def swelling(time_s, position):
 
 
 def run_live(path) -> list[HandSample | Fault]:
-    """Let a hand move, press beyond its range and fall silent for a while; log all of it, and return it."""
+    """Let a hand move, saturate and fall silent for a while; log and return its samples and faults."""
     live: list[HandSample | Fault] = []
     with (
         FaultyEmulator(first_order_hand(forces=swelling, time_constant_s=0.1)) as emulator,
@@ -76,23 +76,23 @@ def run_live(path) -> list[HandSample | Fault]:
     return live
 
 
-def test_the_very_samples_that_were_live(tmp_path):
+def test_a_replay_gives_the_live_samples(tmp_path):
     live = run_live(tmp_path / "a.npz")
-    found: list[HandSample | Fault] = []
+    replayed: list[HandSample | Fault] = []
     with ReplaySource(tmp_path / "a.npz", speed=math.inf, velocity_time_constant=0.05) as replay:
-        found.append(replay.sample())
+        replayed.append(replay.sample())
         while not replay.is_over:
             try:
                 replay.step()
-                found.append(replay.sample())
+                replayed.append(replay.sample())
             except HandError as error:
-                found.append(Fault.of(error, replay.now))
-    for one, other in zip(found, live, strict=True):
-        if isinstance(other, Fault):
-            assert one == other
+                replayed.append(Fault.of(error, replay.now))
+    for event, expected in zip(replayed, live, strict=True):
+        if isinstance(expected, Fault):
+            assert event == expected
         else:
-            assert isinstance(one, HandSample)
-            assert_same_sample(one, other)
+            assert isinstance(event, HandSample)
+            assert_same_sample(event, expected)
     samples = [sample for sample in live if isinstance(sample, HandSample)]
     assert max(float(sample.joint_vel.max()) for sample in samples) > 0.5
     assert samples[-1].is_tip_saturated.any() and not samples[0].is_tip_saturated.any()
@@ -103,16 +103,16 @@ def test_the_very_samples_that_were_live(tmp_path):
 
 
 def sequences(path, **options) -> list[int | str]:
-    """Return what each step of a replay delivers: a reading's number in the log, or an error's name."""
+    """Return for each step of a replay the reading's number in the log, or the error's name."""
     source = ReplaySource(path, speed=math.inf, **options)
-    found: list[int | str] = [(source.sample().reading.sequence - 10) // 2]
+    steps: list[int | str] = [(source.sample().reading.sequence - 10) // 2]
     while not source.is_over:
         try:
             source.step()
-            found.append((source.sample().reading.sequence - 10) // 2)
+            steps.append((source.sample().reading.sequence - 10) // 2)
         except HandError as error:
-            found.append(type(error).__name__)
-    return found
+            steps.append(type(error).__name__)
+    return steps
 
 
 def test_without_a_control_step_each_step_is_a_reading_or_a_failure(tmp_path):
@@ -121,40 +121,40 @@ def test_without_a_control_step_each_step_is_a_reading_or_a_failure(tmp_path):
     assert sequences(path) == [0, 1, "HandTimeoutError", "HandError", 2, "HandError"]
 
 
-def test_a_step_delivers_the_newest_reading_that_had_come(tmp_path):
+def test_a_step_delivers_the_newest_reading(tmp_path):
     # steps end at      1.00  1.02  1.04  1.06  1.08  1.10
     times = np.array([1.0, 1.009, 1.018, 1.027, 1.036, 1.045, 1.055, 1.061, 1.07, 1.08, 1.089])
     path = write_log(tmp_path / "a.npz", random_readings(times))
     assert sequences(path, control_step=0.02) == [0, 2, 4, 6, 9, 10]
 
 
-def test_a_step_waits_for_a_reading_and_is_then_behind(tmp_path):
-    # The step that ends at 1.02 gets what comes at 1.075. So the next ones, due at 1.04 and 1.06, are late: the first of them
-    # ends at 1.075 too and waits for 1.08, and the second at 1.095, 20 ms after that.
+def test_a_step_that_waits_for_a_reading_makes_the_next_late(tmp_path):
+    # The step due at 1.02 waits for the reading at 1.075. So the next one, due at 1.04, is late: it starts at 1.075 and waits for
+    # 1.08. The one after that ends at 1.095, 20 ms after 1.075.
     times = np.array([1.0, 1.075, 1.08, 1.09, 1.1, 1.11, 1.115])
     path = write_log(tmp_path / "a.npz", random_readings(times))
     source = ReplaySource(path, control_step=0.02, speed=math.inf)
-    found = []
+    steps = []
     while not source.is_over:
         source.step()
-        found.append(((source.sample().reading.sequence - 10) // 2, round(source.now, 6), source.num_late_steps))
-    assert found == [(1, 1.075, 0), (2, 1.08, 1), (3, 1.095, 1), (6, 1.115, 1)]
+        steps.append(((source.sample().reading.sequence - 10) // 2, round(source.now, 6), source.num_late_steps))
+    assert steps == [(1, 1.075, 0), (2, 1.08, 1), (3, 1.095, 1), (6, 1.115, 1)]
 
 
-def test_a_gap_is_the_error_that_it_was(tmp_path):
-    """Failures are noticed 80 ms after the last reading, and every 80 ms from then on, as a recording does."""
+def test_a_gap_raises_the_recorded_errors(tmp_path):
+    """As in a recording, failures are noticed 80 ms after the last reading, and every 80 ms from then on."""
     times = np.array([1.0, 1.01, 1.02, 1.5, 1.51, 1.52])
     faults = tuple(Fault(1.1 + 0.08 * i, "HandTimeoutError" if i < 3 else "HandDisconnectedError", str(i)) for i in range(5))
     path = write_log(tmp_path / "a.npz", random_readings(times), faults)
     source = ReplaySource(path, control_step=0.02, speed=math.inf)
-    found = []
+    steps = []
     while not source.is_over:
         try:
             source.step()
-            found.append((source.sample().reading.sequence - 10) // 2)
+            steps.append((source.sample().reading.sequence - 10) // 2)
         except HandError as error:
-            found.append((type(error), str(error), round(source.now, 6)))
-    assert found == [
+            steps.append((type(error), str(error), round(source.now, 6)))
+    assert steps == [
         2,
         (HandTimeoutError, "0", 1.12),  # due at 1.04, given up 80 ms later
         (HandTimeoutError, "1", 1.2),
@@ -167,44 +167,46 @@ def test_a_gap_is_the_error_that_it_was(tmp_path):
     ]
 
 
-def test_a_gap_without_a_failure_is_a_stale_reading(tmp_path):
+def test_a_gap_without_a_recorded_failure_is_a_timeout(tmp_path):
     path = write_log(tmp_path / "a.npz", random_readings(np.array([1.0, 1.01, 2.0])))
     source = ReplaySource(path, control_step=0.02, speed=math.inf)
     source.step()
     with pytest.raises(HandTimeoutError, match=r"no new reading came in time; the newest is 118 ms old"):
-        source.step()  # due at 1.04, given up at 1.12; asked for at 1.002
+        source.step()  # due at 1.04, given up at 1.12; the newest was requested at 1.002
 
 
 def expected_steps(times, faults, control_step: float) -> list[int | str]:
-    """Return what a live source would have delivered, which looks at every instant at which something comes."""
+    """Return what a live source would have delivered, by checking every instant at which something arrives."""
     now = due = times[0]
-    delivered, out = 0, [0]
+    delivered, steps = 0, [0]
     while now < max(times[-1], *(fault.time for fault in faults)):
         due += control_step
         if due < now:
             due = now
         for instant in [due, *(t for t in times if due < t <= due + 0.08)]:
-            came = [i for i, t in enumerate(times) if t <= instant]
-            if came[-1] > delivered and instant - (times[came[-1]] - 0.008) <= 0.1:
-                delivered, now = came[-1], instant
-                out.append(delivered)
+            arrived = [i for i, t in enumerate(times) if t <= instant]
+            if arrived[-1] > delivered and instant - (times[arrived[-1]] - 0.008) <= 0.1:
+                delivered, now = arrived[-1], instant
+                steps.append(delivered)
                 break
         else:
             now = due + 0.08
             last = max(t for t in times if t <= now)
             after = [fault for fault in faults if last < fault.time <= now]
-            out.append(after[-1].kind if after else "HandTimeoutError")
-    return out
+            steps.append(after[-1].kind if after else "HandTimeoutError")
+    return steps
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_against_a_source_that_looks_at_every_instant(tmp_path, seed):
+def test_a_replay_matches_a_source_that_checks_every_instant(tmp_path, seed):
     rng = np.random.default_rng(seed)
     gaps = np.where(rng.random(120) < 0.08, rng.uniform(0.05, 0.4, 120), rng.uniform(0.0084, 0.02, 120))
     times = (5.0 + np.cumsum(gaps)).tolist()
     faults = []
-    for one, other in pairwise(times):
-        faults += [Fault(t, "HandTimeoutError", "") for t in np.arange(one + 0.08, other, 0.08).tolist() if rng.random() < 0.9]
+    for earlier, later in pairwise(times):
+        faults += [
+            Fault(t, "HandTimeoutError", "") for t in np.arange(earlier + 0.08, later, 0.08).tolist() if rng.random() < 0.9
+        ]
     path = write_log(tmp_path / "a.npz", random_readings(np.array(times)), tuple(faults))
     for control_step in (0.005, 0.02, 0.05, 0.3):
         assert sequences(path, control_step=control_step) == expected_steps(times, faults, control_step)
@@ -226,7 +228,7 @@ class Clock:
 
 
 @pytest.mark.parametrize("speed", [0.5, 1.0, 4.0])
-def test_the_original_timing_or_a_multiple(tmp_path, speed):
+def test_a_replay_has_the_original_timing_or_a_multiple(tmp_path, speed):
     times = np.array([1.0, 1.01, 1.03, 1.06])
     path = write_log(tmp_path / "a.npz", random_readings(times))
     clock = Clock()
@@ -238,7 +240,7 @@ def test_the_original_timing_or_a_multiple(tmp_path, speed):
     assert source.sample().reading.age_s(source.now) == pytest.approx(0.008)
 
 
-def test_a_caller_that_is_slow_misses_readings_as_it_would_live(tmp_path):
+def test_a_slow_caller_misses_readings_as_it_would_live(tmp_path):
     times = 1.0 + 0.01 * np.arange(100)
     path = write_log(tmp_path / "a.npz", random_readings(times))
     clock = Clock()
@@ -255,7 +257,7 @@ def test_a_caller_that_is_slow_misses_readings_as_it_would_live(tmp_path):
     assert source.num_late_steps == 1
 
 
-def test_as_fast_as_possible_never_sleeps(tmp_path):
+def test_an_infinite_speed_never_sleeps(tmp_path):
     path = write_log(tmp_path / "a.npz", random_readings(1.0 + 0.01 * np.arange(50)))
     naps: list[float] = []
     source = ReplaySource(path, control_step=0.02, speed=math.inf, clock=lambda: 0.0, sleep=naps.append)
@@ -268,7 +270,7 @@ def test_as_fast_as_possible_never_sleeps(tmp_path):
 # the rest of a source
 
 
-def test_the_end(tmp_path):
+def test_a_step_after_the_end_raises(tmp_path):
     path = write_log(tmp_path / "a.npz", random_readings(np.array([1.0, 1.01])))
     source = ReplaySource(path, speed=math.inf)
     source.step()
@@ -280,24 +282,24 @@ def test_the_end(tmp_path):
     assert source.sample() is last
 
 
-def test_starting_anew(tmp_path):
+def test_rewind_starts_again(tmp_path):
     path = write_log(tmp_path / "a.npz", random_readings(1.0 + 0.01 * np.arange(6)))
     source = ReplaySource(path, speed=math.inf)
-    first, found = source.sample(), []
+    first, samples = source.sample(), []
     for _ in range(5):
         source.step()
-        found.append(source.sample())
+        samples.append(source.sample())
     source.rewind()
     assert_same_sample(source.sample(), first)
     assert not source.is_over
-    for expected in found[:3]:
+    for expected in samples[:3]:
         source.step()
         assert_same_sample(source.sample(), expected)
     source.close()
     assert source.is_over
 
 
-def test_a_reset_forgets_speeds_and_reads_on(tmp_path):
+def test_reset_zeroes_velocities_and_continues(tmp_path):
     path = write_log(tmp_path / "a.npz", random_readings(1.0 + 0.01 * np.arange(12)))
     source = ReplaySource(path, speed=math.inf)
     source.step()
@@ -305,7 +307,7 @@ def test_a_reset_forgets_speeds_and_reads_on(tmp_path):
     source.reset()
     assert source.sample().reading.received_at == 1.02
     assert not source.sample().joint_vel.any()
-    # With a control step: now is 1.02. What was asked for at 1.012 and came then is not of now; what was asked for at 1.022 is.
+    # With a control step, now is 1.02. The reading that arrived then was requested at 1.012, too early; the next, at 1.022.
     source = ReplaySource(path, speed=math.inf, control_step=0.02)
     source.step()
     source.reset()
@@ -319,7 +321,7 @@ def test_a_reset_forgets_speeds_and_reads_on(tmp_path):
         source.reset()
 
 
-def test_a_reset_in_a_gap(tmp_path):
+def test_reset_in_a_gap_raises_the_recorded_error(tmp_path):
     faults = (Fault(1.09, "HandTimeoutError", "silent"),)
     path = write_log(tmp_path / "a.npz", random_readings(np.array([1.0, 1.01, 1.2])), faults)
     source = ReplaySource(path, speed=math.inf, control_step=0.01)
@@ -329,7 +331,7 @@ def test_a_reset_in_a_gap(tmp_path):
     assert source.now == pytest.approx(1.09)
 
 
-def test_a_sample_is_what_the_state_says(tmp_path):
+def test_a_sample_matches_the_logged_state(tmp_path):
     readings = random_readings(np.array([1.0, 1.01]))
     source: Source = ReplaySource(write_log(tmp_path / "a.npz", readings), speed=math.inf, velocity_time_constant=0.0)
     assert isinstance(source, ReplaySource)
@@ -347,7 +349,7 @@ def test_a_sample_is_what_the_state_says(tmp_path):
         source.state()
 
 
-def test_another_calibration_than_the_log_s(tmp_path):
+def test_a_calibration_overrides_the_logs(tmp_path):
     readings = random_readings(np.array([1.0]))
     path = write_log(tmp_path / "a.npz", readings, calibration=NEWTON)
     other = replace(NEWTON, scale=2 * NEWTON.scale)
@@ -358,7 +360,7 @@ def test_another_calibration_than_the_log_s(tmp_path):
 
 
 @pytest.mark.parametrize("options", [{"speed": 0.0}, {"speed": math.nan}, {"control_step": 0.0}, {"control_step": math.inf}])
-def test_speeds_and_steps_that_cannot_be(tmp_path, options):
+def test_invalid_speeds_and_control_steps_are_refused(tmp_path, options):
     ((name, value),) = options.items()
     message = f"^{name} is {value:g}( s)?, expected more than 0"
     path = write_log(tmp_path / "a.npz", random_readings(np.array([1.0])))
@@ -366,6 +368,6 @@ def test_speeds_and_steps_that_cannot_be(tmp_path, options):
         ReplaySource(path, **options)
 
 
-def test_no_log(tmp_path):
+def test_a_missing_log_is_an_error(tmp_path):
     with pytest.raises(LogError, match="No such file"):
         ReplaySource(tmp_path / "none.npz")

@@ -1,4 +1,4 @@
-"""The parser against a reference that sees whole streams, over random, damaged, cut and merged ones."""
+"""The parser against a reference on whole streams: random, damaged, cut and merged ones."""
 
 from itertools import pairwise
 from random import Random
@@ -22,11 +22,11 @@ GARBAGE = st.one_of(st.binary(max_size=30), st.sampled_from([b"\x55", b"\xaa", b
 
 @st.composite
 def damaged(draw):
-    """A frame with bytes flipped, left out or put in."""
+    """A frame with bytes changed, removed or inserted."""
     raw = bytearray(draw(st.one_of(FRAMES, NESTED)))
     for _ in range(draw(st.integers(1, 3))):
-        at = draw(st.integers(0, max(len(raw) - 1, 0)))
-        raw[at : at + draw(st.integers(0, 4))] = draw(st.binary(max_size=4))
+        index = draw(st.integers(0, max(len(raw) - 1, 0)))
+        raw[index : index + draw(st.integers(0, 4))] = draw(st.binary(max_size=4))
     return bytes(raw)
 
 
@@ -37,55 +37,55 @@ CUTS = st.lists(st.integers(0, 3000), max_size=8)
 
 
 def parsed(stream: bytes, cuts: list[int]) -> list[tuple[int, int, int, bytes]]:
-    """Parse a stream in pieces; what is kept must stay within bounds, and every byte must be accounted for."""
-    parser, found = FrameParser(), []
-    places = [0, *sorted(cut % (len(stream) + 1) for cut in cuts), len(stream)]
-    for start, end in pairwise(places):
-        found += parser.feed(stream[start:end])
+    """Parse a stream in pieces; the buffer must stay within bounds, and every byte must be accounted for."""
+    parser, frames = FrameParser(), []
+    offsets = [0, *sorted(cut % (len(stream) + 1) for cut in cuts), len(stream)]
+    for start, end in pairwise(offsets):
+        frames += parser.feed(stream[start:end])
         assert parser.num_buffered <= BOUND
-    found += parser.flush()
+    frames += parser.flush()
     assert parser.num_buffered == 0
-    assert parser.num_discarded + sum(9 + len(frame.payload) for frame in found) == len(stream)
-    return [(frame.source, frame.destination, frame.command, frame.payload) for frame in found]
+    assert parser.num_discarded + sum(9 + len(frame.payload) for frame in frames) == len(stream)
+    return [(frame.source, frame.destination, frame.command, frame.payload) for frame in frames]
 
 
-def agrees(stream: bytes, cuts: list[int]) -> None:
+def assert_agrees(stream: bytes, cuts: list[int]) -> None:
     assert parsed(stream, cuts) == frames_of(stream)
 
 
 @given(STREAMS, CUTS)
 @settings(max_examples=500, deadline=None)
-def test_any_stream_cut_anywhere_reads_as_a_whole(stream, cuts):
-    agrees(stream, cuts)
+def test_cuts_do_not_change_the_frames_of_a_stream(stream, cuts):
+    assert_agrees(stream, cuts)
 
 
 @given(st.lists(SMALL_PIECES, min_size=1, max_size=8), st.integers(0, 2**32))
 @settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
-def test_two_thousand_streams_merged_mutated_and_cut(pieces, seed):
-    """Twenty streams of the same pieces each."""
+def test_merged_mutated_and_cut_streams_agree_with_the_reference(pieces, seed):
+    """Twenty streams from each list of pieces."""
     random = Random(seed)
     for _ in range(20):
         stream = bytearray(b"".join(random.choices(pieces, k=random.randint(0, 5))))
         for _ in range(random.randint(0, 3)):
-            at = random.randint(0, len(stream))
-            stream[at : at + random.randint(0, 4)] = random.randbytes(random.randint(0, 4))
-        agrees(bytes(stream), random.choices(range(300), k=random.randint(0, 5)))
+            index = random.randint(0, len(stream))
+            stream[index : index + random.randint(0, 4)] = random.randbytes(random.randint(0, 4))
+        assert_agrees(bytes(stream), random.choices(range(300), k=random.randint(0, 5)))
 
 
 @given(st.lists(FRAMES, max_size=20), CUTS)
 @settings(max_examples=200, deadline=None)
-def test_of_a_clean_stream_no_frame_is_lost(frames, cuts):
-    assert [frame_bytes(*found) for found in parsed(b"".join(frames), cuts)] == frames
+def test_a_clean_stream_loses_no_frame(frames, cuts):
+    assert [frame_bytes(*fields) for fields in parsed(b"".join(frames), cuts)] == frames
 
 
 @given(st.lists(st.tuples(st.binary(max_size=50).map(lambda raw: raw.replace(b"\x55", b"\x54")), FRAMES), max_size=10), CUTS)
 @settings(max_examples=200, deadline=None)
 def test_garbage_without_a_header_costs_no_frame(pairs, cuts):
     stream = b"".join(garbage + frame for garbage, frame in pairs)
-    assert [frame_bytes(*found) for found in parsed(stream, cuts)] == [frame for _, frame in pairs]
+    assert [frame_bytes(*fields) for fields in parsed(stream, cuts)] == [frame for _, frame in pairs]
 
 
-def test_what_trails_the_last_frame_is_counted():
+def test_bytes_after_the_last_frame_are_counted():
     parser = FrameParser()
     parser.feed(b"\x01\x02" + BIG + b"\x55\x03\x04\x55")
     assert (parser.num_discarded, parser.num_trailing) == (5, 3)
@@ -95,11 +95,11 @@ def test_what_trails_the_last_frame_is_counted():
     assert (parser.num_discarded, parser.num_trailing) == (6, 0)
 
 
-def test_byte_by_byte():
-    agrees(BIG + b"\x55" + BIG, list(range(2 * len(BIG) + 1)))
+def test_a_stream_parses_byte_by_byte():
+    assert_agrees(BIG + b"\x55" + BIG, list(range(2 * len(BIG) + 1)))
 
 
-def test_frames_come_out_as_soon_as_they_are_whole():
+def test_frames_are_returned_as_soon_as_they_are_complete():
     parser = FrameParser()
     for byte in BIG[:-1]:
         assert parser.feed(bytes([byte])) == []
@@ -107,7 +107,7 @@ def test_frames_come_out_as_soon_as_they_are_whole():
     assert parser.num_buffered == 0
 
 
-def test_a_frame_behind_a_head_that_promises_more_is_found_when_the_line_falls_silent():
+def test_flush_finds_a_frame_after_a_header_with_a_wrong_length():
     parser = FrameParser()
     assert parser.feed(b"\x55\xaa\x80\xfe\x02\x00\x20" + BIG) == []
     assert [len(frame.payload) for frame in parser.flush()] == [2208]
@@ -119,8 +119,8 @@ def test_a_frame_within_another_is_payload():
     assert parsed(outer, [10, 12]) == [(0x80, 0xFE, 0x15, b"<" + inner + b">")]
 
 
-def test_heads_that_lead_nowhere_keep_memory_and_work_bounded():
-    """Each head promises the longest frame: every candidate costs one checksum of 8 KiB, no more."""
+def test_headers_without_frames_keep_memory_and_work_bounded():
+    """Each header announces the longest frame: every candidate costs one checksum of 8 KiB."""
     parser = FrameParser()
     assert parser.feed(b"\x55\xaa\x00\x00\x00\x20\x20" * 20_000) == []
     assert parser.num_buffered <= BOUND

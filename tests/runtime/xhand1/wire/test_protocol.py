@@ -17,7 +17,7 @@ WORD = st.integers(0, 0xFFFF)
 SHORT = st.integers(-0x8000, 0x7FFF)
 
 
-def test_the_checksum_of_the_published_vector():
+def test_the_checksum_matches_the_published_vector():
     assert protocol.crc16(b"123456789") == 0x31C3
 
 
@@ -26,13 +26,13 @@ def test_the_checksum_is_the_polynomial_division(data):
     assert protocol.crc16(data) == bitwise_crc16(data)
 
 
-def test_a_version_request_is_the_published_one():
+def test_a_version_request_matches_the_published_bytes():
     frame = Frame(protocol.HOST_ADDRESS, protocol.hand_address(0), protocol.Command.VERSION)
     assert protocol.encode_frame(frame) == bytes.fromhex("55 aa fe 80 13 00 00 ef c3")
     assert FrameParser().feed(bytes.fromhex("55aafe80130000efc3")) == [frame]
 
 
-def test_sizes_are_the_published_ones():
+def test_sizes_match_the_published_ones():
     passive = protocol.encode_command(protocol.PASSIVE)
     assert len(passive) == protocol.COMMAND_SIZE == 288
     assert protocol.STATE_SIZE == 2208
@@ -40,19 +40,23 @@ def test_sizes_are_the_published_ones():
     assert len(protocol.encode_frame(Frame(0x80, 0xFE, 2, bytes(2208)))) == 2217
 
 
-def test_the_passive_command_byte_by_byte():
+def test_the_passive_command_matches_byte_by_byte():
     assert protocol.encode_command(protocol.PASSIVE) == b"".join(struct.pack("<H", i) + bytes(22) for i in range(12))
 
 
-def test_a_command_byte_by_byte():
+def test_a_command_matches_byte_by_byte():
     joints = [JointCommand(0.5 * i, 100 + i, -i, 2 * i, 300 + i, Mode.POSITION) for i in range(12)]
     payload = protocol.encode_command(joints)
     for i in range(12):
-        at = 24 * i
-        assert int.from_bytes(payload[at : at + 2], "little") == i
-        assert [int.from_bytes(payload[at + k : at + k + 2], "little", signed=True) for k in (2, 4, 6)] == [100 + i, -i, 2 * i]
-        assert np.frombuffer(payload[at + 8 : at + 12], "<f4")[0] == np.float32(0.5 * i)
-        assert [int.from_bytes(payload[at + k : at + k + 2], "little") for k in (12, 14, 16, 18, 20, 22)] == [
+        start = 24 * i
+        assert int.from_bytes(payload[start : start + 2], "little") == i
+        assert [int.from_bytes(payload[start + k : start + k + 2], "little", signed=True) for k in (2, 4, 6)] == [
+            100 + i,
+            -i,
+            2 * i,
+        ]
+        assert np.frombuffer(payload[start + 8 : start + 12], "<f4")[0] == np.float32(0.5 * i)
+        assert [int.from_bytes(payload[start + k : start + k + 2], "little") for k in (12, 14, 16, 18, 20, 22)] == [
             300 + i,
             3,
             0,
@@ -62,7 +66,7 @@ def test_a_command_byte_by_byte():
         ]
 
 
-def test_a_state_byte_by_byte():
+def test_a_state_matches_byte_by_byte():
     payload = bytearray(2208)
     payload[24 * 7 : 24 * 8] = struct.pack("<BBf9H", 7, 3, 1.25, 40, 5000, 0x1220, 1, 2, 3, 4, 5, 6)
     tip = 288 + 384 * 2
@@ -101,7 +105,7 @@ def test_saturation(counts, is_end):
 
 @given(st.binary(min_size=2208, max_size=2208))
 @settings(max_examples=200, deadline=None)
-def test_any_state_comes_back_byte_for_byte(payload):
+def test_any_state_round_trips_byte_for_byte(payload):
     assert protocol.encode_state(protocol.decode_state(payload)) == payload
 
 
@@ -110,19 +114,19 @@ JOINT = st.builds(JointCommand, st.floats(width=32, allow_nan=False, allow_infin
 
 @given(st.lists(JOINT, min_size=12, max_size=12))
 @settings(max_examples=100, deadline=None)
-def test_any_command_comes_back(joints):
+def test_any_command_round_trips(joints):
     assert protocol.decode_command(protocol.encode_command(joints)) == tuple(joints)
 
 
 @given(BYTE, BYTE, BYTE.filter(lambda c: c not in protocol.FIRMWARE_COMMANDS), st.binary(max_size=400))
 @settings(max_examples=200, deadline=None)
-def test_any_frame_comes_back(source, destination, command, payload):
+def test_any_frame_round_trips(source, destination, command, payload):
     frame = Frame(source, destination, command, payload)
     assert FrameParser().feed(protocol.encode_frame(frame)) == [frame]
 
 
 @pytest.mark.parametrize("command", sorted(protocol.FIRMWARE_COMMANDS))
-def test_firmware_is_never_written(command):
+def test_firmware_commands_are_refused(command):
     with pytest.raises(ProtocolError, match="writes firmware; it is never sent"):
         protocol.encode_frame(Frame(0xFE, 0x80, command))
 
@@ -140,7 +144,7 @@ def test_firmware_is_never_written(command):
         (lambda: protocol.decode_state(bytes(2207)), "a state of 2207 bytes, expected 2208"),
     ],
 )
-def test_what_does_not_fit_is_refused(wrong, message):
+def test_values_outside_the_protocol_are_refused(wrong, message):
     with pytest.raises(ProtocolError, match=message):
         wrong()
 
