@@ -1,4 +1,4 @@
-"""What a kind may ask for and give: frames, contacts, surfaces, a reach of its own, reports per body, memory of any shape."""
+"""What a kind may request and return: frames, contacts, surfaces, its own reach, reports per body, memory of any shape."""
 
 import copy
 import dataclasses
@@ -56,13 +56,13 @@ def lower(spec, layout, surface_of):
 
 
 def forward(gathered, context, constants, state):
-    met, contacts = gathered[ContactDepth], gathered[Contacts]
-    frame = met.frames["ball"]
-    seen, *_ = planes.add(planes.rotate(frame.rotation, met.pos), frame.offset)
+    penetration, contacts = gathered[ContactDepth], gathered[Contacts]
+    frame = penetration.frames["ball"]
+    seen, *_ = planes.add(planes.rotate(frame.rotation, penetration.pos), frame.offset)
     calls = state["calls"] + 1
     net = {f"net_{axis}": part for axis, part in zip("xyz", contacts.net, strict=True)}
     area = constants["area"].expand_as(net["net_x"])
-    planes_out = {"seen_x": seen, "depth": met.depth, "calls": calls[:, 0, :1].expand_as(seen), **net, "area": area}
+    planes_out = {"seen_x": seen, "depth": penetration.depth, "calls": calls[:, 0, :1].expand_as(seen), **net, "area": area}
     assert contacts.force[0].shape[1:] == (2, 6)  # bodies, slots of two objects
     return planes_out, {"calls": calls}
 
@@ -95,16 +95,16 @@ class Areas:
     unused: object = None
 
 
-def test_constants_of_a_dataclass(build, tmp_path):
-    """The kind gets the dataclass, with None for what `lower` leaves out; plan and artefact have the same names as before."""
-    seen = []
+def test_constants_may_be_a_dataclass(build, tmp_path):
+    """The kind gets the dataclass, with None for what `lower` omits; names in plan and artefact do not change."""
+    received = []
 
     def lower_typed(spec, layout, surface_of):
         lowered = lower(spec, layout, surface_of)
         return dataclasses.replace(lowered, constants=Areas(lowered.constants["area"]))
 
     def forward_typed(gathered, context, constants, state):
-        seen.append(constants)
+        received.append(constants)
         return forward(gathered, context, {"area": constants.area}, state)
 
     typed = Kind(ProbeAllSpec, lower_typed, forward_typed, KIND.reference, constants=Areas)
@@ -112,16 +112,16 @@ def test_constants_of_a_dataclass(build, tmp_path):
     assert touch.plan.to_json() == mapped.plan.to_json()
     assert touch.plan.arrays.keys() == mapped.plan.arrays.keys()
     state = touch.example_state(3)
-    found, expected = touch(state), mapped(state)
-    assert all(torch.equal(found[name], expected[name]) for name in expected)
-    assert all(isinstance(own, Areas) and own.unused is None for own in seen) and seen
+    readings, expected = touch(state), mapped(state)
+    assert all(torch.equal(readings[name], expected[name]) for name in expected)
+    assert all(isinstance(each, Areas) and each.unused is None for each in received) and received
     tgdsl.save(touch, tmp_path / "touch.safetensors")
     loaded = tgdsl.load(tmp_path / "touch.safetensors", kinds=[typed], dtype=torch.float64)
     assert torch.equal(loaded(state)["s"], expected["s"])
-    assert seen[-1].area.dtype == loaded.dtype
+    assert received[-1].area.dtype == loaded.dtype
 
 
-def test_a_kind_gets_what_it_asks_for(build):
+def test_a_kind_gets_what_it_requests(build):
     touch = build()
     assert touch.inputs.slots == 3
     assert {output.name: (output.rows, output.shape) for output in touch.outputs} == {
@@ -150,7 +150,7 @@ def test_a_kind_gets_what_it_asks_for(build):
     assert touch.state_dict()["memory.s:calls"].shape == (4, 2, 3)
 
 
-def test_the_reach_is_the_kinds_own(build):
+def test_a_kind_sets_its_reach(build):
     """The probe of b, 10 mm above its centre, is 0.4 mm inside and 0.4 mm outside the ball of 30 mm."""
     touch = build(reach=0.001, gate="geometric")
     state = touch.example_state(2)
@@ -164,7 +164,7 @@ def test_the_reach_is_the_kinds_own(build):
     np.testing.assert_allclose(touch(state)["s"][:, 1, 1], [0.0014, 0.0006], atol=1e-12)
 
 
-def test_what_a_kind_refuses_is_a_located_mistake(build):
+def test_mistakes_that_a_kind_reports_name_their_field(build):
     with pytest.raises(SpecError, match=r"sensors\.s\.reach: reach -1 m is negative; expected at least 0"):
         build(reach=-1.0)
 
@@ -174,10 +174,10 @@ class Temperature(Request[torch.Tensor]):
     """A request that no quantity answers."""
 
 
-def test_a_request_that_no_quantity_answers_is_named(build):
-    asking = dataclasses.replace(KIND, lower=lambda *given: dataclasses.replace(lower(*given), requests=(Temperature(),)))
+def test_an_unanswered_request_is_named(build):
+    kind = dataclasses.replace(KIND, lower=lambda *arguments: dataclasses.replace(lower(*arguments), requests=(Temperature(),)))
     with pytest.raises(TgdslError, match=r'^no known quantity answers the request "Temperature"; give its kind the quantity'):
-        build(asking)
+        build(kind)
 
 
 def former(felt, probes, constants, state):
@@ -185,7 +185,7 @@ def former(felt, probes, constants, state):
 
 
 def unchecked(record, **change):
-    """Return a record with other values, of whatever types: as its author makes it where nobody checks them."""
+    """Return a copy of a record with other values, without checks of their types."""
     record = copy.copy(record)
     for name, value in change.items():
         object.__setattr__(record, name, value)
@@ -203,7 +203,7 @@ WRONG_KINDS = {
 
 
 @pytest.mark.parametrize("message", WRONG_KINDS)
-def test_a_kind_that_cannot_be_called_as_kinds_are_is_refused_by_name(build, message):
+def test_a_kind_with_a_wrong_signature_is_refused_by_name(build, message):
     with pytest.raises(TgdslError) as error:
         build(unchecked(KIND, **WRONG_KINDS[message]))
     assert 'kind "probe_all": ' in str(error.value) and message in str(error.value)
@@ -228,12 +228,12 @@ WRONG_PARTS = {
 
 
 @pytest.mark.parametrize("message", WRONG_PARTS)
-def test_what_a_kind_may_not_say_of_a_sensor_is_named(build, message):
+def test_invalid_parts_of_a_lowered_sensor_are_named(build, message):
     change = WRONG_PARTS[message]
     change = {"state": {"a": Memory(shape=Temperature)}} if change == "temperature" else change
 
-    def lowered(*given):
-        return unchecked(lower(*given), **change)
+    def lowered(*arguments):
+        return unchecked(lower(*arguments), **change)
 
     with pytest.raises(TgdslError) as error:
         build(dataclasses.replace(KIND, lower=lowered))
@@ -250,23 +250,23 @@ WRONG_ANSWERS = {
 
 
 @pytest.mark.parametrize("message", WRONG_ANSWERS)
-def test_what_forward_may_not_return_is_named(build, message):
-    touch = build(dataclasses.replace(KIND, forward=lambda *given: WRONG_ANSWERS[message](*forward(*given))))
+def test_invalid_results_of_forward_are_named(build, message):
+    touch = build(dataclasses.replace(KIND, forward=lambda *arguments: WRONG_ANSWERS[message](*forward(*arguments))))
     with pytest.raises(TgdslError) as error:
         touch(touch.example_state(3))
     assert 'sensor "s": `forward` of the kind "probe_all" returns' in str(error.value) and message in str(error.value)
 
 
-def test_what_was_not_asked_for_is_named(build):
-    def asking(*given):
-        return dataclasses.replace(lower(*given), requests=(Contacts(given[0].objects, slots=3),))
+def test_an_answer_that_was_not_requested_is_named(build):
+    def lower_to_contacts(*arguments):
+        return dataclasses.replace(lower(*arguments), requests=(Contacts(arguments[0].objects, slots=3),))
 
-    touch = build(dataclasses.replace(KIND, lower=asking))
+    touch = build(dataclasses.replace(KIND, lower=lower_to_contacts))
     with pytest.raises(TgdslError, match=r"gathered\[ContactDepth\] was not asked for.*which hold Contacts"):
         touch(touch.example_state(2))
 
 
-def test_a_kind_without_numbers_is_of_the_modules_dtype(tmp_path):
+def test_a_kind_without_constants_has_the_modules_dtype(tmp_path):
     class NothingSpec(LinkSpec):
         """Reads nothing."""
 
@@ -297,14 +297,14 @@ def test_a_kind_without_numbers_is_of_the_modules_dtype(tmp_path):
         ({"release_threshold": "1 mm"}, "release_threshold is of a sensor with a threshold"),
     ],
 )
-def test_noise_that_a_kinds_rows_cannot_have_is_a_located_mistake(build, noise, message):
+def test_noise_that_does_not_fit_a_kinds_rows_is_a_mistake(build, noise, message):
     knobs = frozenset({"crosstalk", "release_threshold"})
-    asking = unchecked(KIND, knobs=knobs, lower=lambda *given: dataclasses.replace(lower(*given), rows=Axis("voxel", 2)))
+    kind = unchecked(KIND, knobs=knobs, lower=lambda *arguments: dataclasses.replace(lower(*arguments), rows=Axis("voxel", 2)))
     with pytest.raises(SpecError, match=rf"sensors\.s\.noise: {message}"):
-        build(asking, noise=noise)
+        build(kind, noise=noise)
 
 
-def test_contacts_with_nothing_are_refused(build):
-    asking = unchecked(KIND, lower=lambda *given: dataclasses.replace(lower(*given), requests=(Contacts((), slots=3),)))
+def test_contacts_without_objects_are_refused(build):
+    kind = unchecked(KIND, lower=lambda *arguments: dataclasses.replace(lower(*arguments), requests=(Contacts((), slots=3),)))
     with pytest.raises(TgdslError, match="Contacts is asked of no objects"):
-        build(asking)
+        build(kind)

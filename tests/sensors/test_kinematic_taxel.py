@@ -20,13 +20,13 @@ from tgdsl.testing import KindConformance
 
 class TestKinematicTaxel(KindConformance):
     kind = KINEMATIC_TAXEL
-    test_compiled_equals_eager = None  # its graph is part of that of all options
+    test_compiled_equals_eager = None  # its graph is part of the one of all options
 
 
 class TestKinematicTaxelAsInThePaper(KindConformance):
     kind = KINEMATIC_TAXEL
     parameters = {"model": "paper", "outputs": ["force"]}
-    test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
+    test_compiled_equals_eager = None  # its graph is part of the one of all options
 
 
 class TestKinematicTaxelWithAllOptions(KindConformance):
@@ -37,7 +37,7 @@ class TestKinematicTaxelWithAllOptions(KindConformance):
 class TestKinematicTaxelInTheCone(KindConformance):
     kind = KINEMATIC_TAXEL
     parameters = {"friction_cone": 0.2}
-    test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
+    test_compiled_equals_eager = None  # its graph is part of the one of all options
 
 
 class TestKinematicTaxelOfALattice(KindConformance):
@@ -46,19 +46,19 @@ class TestKinematicTaxelOfALattice(KindConformance):
     test_compiled_equals_eager = None  # pointwise
 
 
-def test_a_loop_is_a_play_beside_the_law(tmp_path):
-    """With α = 1: f = (k + Q/r) d − (Q/r) p, p the play of width r by its own definition: p ← max(d − r, min(d + r, p))."""
+def test_a_loop_adds_a_play_to_the_law(tmp_path):
+    """With α = 1: f = (k + Q/r) d − (Q/r) p, where p is the play of width r: p ← max(d − r, min(d + r, p))."""
     k, force, width = 900.0, 0.4, 6e-4
     sensor = {**kinematic.STILL, "normal_stiffness": k, "depth_exponent": 1, "loop": {"force": force, "width": width}}
     touch, play = module(tmp_path, [(0.0, 0.0, 0.0)], BOX, kind="kinematic_taxel", **sensor), 0.0
     for d in 1e-3 * (3 + 2.5 * np.sin(0.3 * np.arange(40)) + 0.4 * np.sin(1.1 * np.arange(40))):
         play = max(d - width, min(d + width, play))
         expected = (k + force / width) * d - force / width * play
-        found = -touch(state(touch, pos=[0, 0, 0.03 - d]))["s"][0, 0, 2].item()
-        assert found == pytest.approx(max(0.0, expected), rel=1e-9, abs=1e-12)
+        reading = -touch(state(touch, pos=[0, 0, 0.03 - d]))["s"][0, 0, 2].item()
+        assert reading == pytest.approx(max(0.0, expected), rel=1e-9, abs=1e-12)
     touch(state(touch, pos=[0, 0, 0.05]))
     again = -touch(state(touch, pos=[0, 0, 0.03 - 1e-4]))["s"][0, 0, 2].item()
-    assert again == pytest.approx((k + force / width) * 1e-4, rel=1e-9)  # a contact that was lost begins at the origin
+    assert again == pytest.approx((k + force / width) * 1e-4, rel=1e-9)  # a lost contact restarts at the origin
 
 
 @pytest.mark.filterwarnings("ignore:poses of bodies are not finite")
@@ -67,7 +67,7 @@ def test_a_loop_is_a_play_beside_the_law(tmp_path):
     [{"loop": {"force": 0.4, "width": "1 mm"}}, {"noise": {"hysteresis": {"strength": 0.5, "time_constant": "50 ms"}}}],
     ids=["loop", "hysteresis"],
 )
-def test_memory_goes_on_after_a_broken_pose_as_if_it_was_not_read(tmp_path, options):
+def test_a_broken_pose_leaves_the_memory_unchanged(tmp_path, options):
     def forces(heights):
         touch = module(tmp_path, [(0.0, 0.0, 0.0)], BOX, kind="kinematic_taxel", **kinematic.STILL, **options)
         dt = 0.01 if "dt" in touch.inputs.fields else None
@@ -79,7 +79,7 @@ def test_memory_goes_on_after_a_broken_pose_as_if_it_was_not_read(tmp_path, opti
 
 
 def test_a_lattice_stiffens_as_its_cells_close():
-    """At half the depth of densification, the law's force twice; beyond it, finite."""
+    """At half the depth of densification the force doubles; beyond it, the force is finite."""
     (force,) = read(sensor={**kinematic.STILL, "densification": 0.008})[2:]
     assert force == pytest.approx(-2 * 500 * S, rel=1e-12)
     (force,) = read(sensor={**kinematic.STILL, "densification": 0.002})[2:]
@@ -94,7 +94,7 @@ def test_the_papers_model_has_the_papers_sign():
 
 
 def test_a_moving_frame_feels_only_relative_motion(tmp_path):
-    """Link and object turning as one rigid body: no relative velocity anywhere, whatever the place of the probe."""
+    """Link and object turn as one rigid body: no probe has a relative velocity."""
     touch = module(tmp_path, [(0.01, 0.004, 0.0)], BOX, kind="kinematic_taxel")
     spin, drift = np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.1, -0.2])
     still, moving = state(touch, **ABOVE), state(touch, **ABOVE)
@@ -106,14 +106,14 @@ def test_a_moving_frame_feels_only_relative_motion(tmp_path):
 
 
 @pytest.mark.parametrize("outputs", [["force"], ["torque"], ["torque", "force"]])
-def test_outputs_are_what_is_asked_for_in_one_order(outputs):
+def test_requested_outputs_come_in_one_order(outputs):
     whole = read(probe=(0.01, 0, 0), linvel=[0.1, 0, 0])
     part = read(probe=(0.01, 0, 0), sensor={"outputs": outputs}, linvel=[0.1, 0, 0])
     expected = {1: {"force": whole[:3], "torque": whole[3:]}.get(outputs[0]), 2: whole}[len(outputs)]
     np.testing.assert_array_equal(part, expected)
 
 
-def test_what_is_not_needed_is_not_wanted(tmp_path):
+def test_unneeded_inputs_are_not_required(tmp_path):
     """Without damping no velocities are read; without torque no spin."""
     still = {"normal_damping": 0, "shear_damping": 0, "spin_damping": 0}
     touch = module(tmp_path, [(0, 0, 0)], BOX, kind="kinematic_taxel", **still)
@@ -127,13 +127,13 @@ def test_what_is_not_needed_is_not_wanted(tmp_path):
 
 @pytest.mark.parametrize("model", ["tgdsl", "paper"])
 def test_friction_ends_at_the_cone(model):
-    """Up to μ f_n friction is k_t v, beyond it is μ f_n, in the direction of either model; the normal force is untouched."""
-    found = kinematic.cone(model)
-    assert model == "paper" or found.paper_error > 100
+    """Up to μ f_n friction is k_t v, beyond it is μ f_n, in the model's direction; the normal force does not change."""
+    comparison = kinematic.cone(model)
+    assert model == "paper" or comparison.paper_error > 100
 
 
-def test_the_cone_is_that_of_the_whole_normal_force():
-    """Damping counts: an object that leaves fast enough to pull has no friction at all."""
+def test_the_cone_uses_the_whole_normal_force():
+    """Damping counts: an object that leaves fast enough to pull has no friction."""
     sensor = {"friction_cone": 0.4, "outputs": ["force"]}
     x, _, z = read(sensor=sensor, linvel=[10, 0, -100])
     np.testing.assert_allclose(x, -0.4 * z, rtol=1e-12)
@@ -143,14 +143,14 @@ def test_the_cone_is_that_of_the_whole_normal_force():
     assert (x, y) == (0, 0)
 
 
-def test_a_cone_of_zero_is_no_friction():
+def test_a_cone_of_zero_has_no_friction():
     np.testing.assert_allclose(
         read(sensor={"friction_cone": 0, "outputs": ["force"]}, linvel=[1, 2, 0]), [0, 0, -500 * S], rtol=1e-12
     )
 
 
-def test_torque_about_the_taxel_is_the_spin_alone():
-    """The lever of the force is left out: where the link's origin lies no longer matters."""
+def test_torque_about_the_taxel_is_only_spin():
+    """The lever of the force is omitted: the position of the link's origin does not matter."""
     probe, motion = (0.01, -0.005, 0.0), {"linvel": [0.1, 0.2, 0], "angvel": [0, 0, 3]}
     about_link = read(probe=probe, **motion)
     about_taxel = read(probe=probe, sensor={"torque_about": "taxel"}, **motion)
@@ -166,118 +166,118 @@ DRAGGED = {**ABOVE, "linvel": [0.1, -0.3, 0.2], "angvel": [0, 0, 2]}
 
 @pytest.mark.parametrize("model", ["tgdsl", "paper"])
 def test_balanced_taxels_press_with_the_solvers_force(model):
-    """The normal forces sum to Σ f_c · m_c in the law's proportions; friction is the solver's where the law's is larger.
+    """Normal forces sum to Σ f_c · m_c in the law's proportions; friction is the solver's where the law's is larger.
 
-    Flat on the box each of six taxels has a sixth of all: 0.5 N/6 of friction, and with its radius of 1 cm that of a torque.
+    Flat on the box each of six taxels has a sixth: 0.5 N/6 of friction and, with its radius of 1 cm, a sixth of the torque.
     """
-    found, plain = balanced(SIX, [[0.3, 0, -1.5], [0, 0.2, -0.5]], [[0, 0, -1]] * 2, DRAGGED, model=model)
-    np.testing.assert_allclose(found[:, 2].sum(), -2.0, rtol=1e-12)
+    readings, plain = balanced(SIX, [[0.3, 0, -1.5], [0, 0.2, -0.5]], [[0, 0, -1]] * 2, DRAGGED, model=model)
+    np.testing.assert_allclose(readings[:, 2].sum(), -2.0, rtol=1e-12)
     along = plain[:, :2] / np.linalg.norm(plain[:, :2], axis=1)[:, None]
-    np.testing.assert_allclose(found[:, :2], 0.5 / 6 * along, rtol=1e-12)
+    np.testing.assert_allclose(readings[:, :2], 0.5 / 6 * along, rtol=1e-12)
     twist = {"tgdsl": 0.01, "paper": -0.01}[model] * 0.5 / 6
-    np.testing.assert_allclose(found[:, 3:], np.cross(SIX, found[:, :3]) + [0, 0, twist], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(readings[:, 3:], np.cross(SIX, readings[:, :3]) + [0, 0, twist], rtol=1e-12, atol=1e-15)
 
 
-def test_balanced_friction_below_its_limit_is_the_laws():
-    """k_t v and k_ω ω, whatever the depth is scaled with: under 100 N as under 1 N."""
+def test_balanced_friction_below_its_limit_follows_the_law():
+    """k_t v and k_ω ω, however the depth is scaled: at 100 N as at 1 N."""
     item = {**ABOVE, "linvel": [1e-3, 0, 0], "angvel": [0, 0, 1e-4]}
     for load in (1.0, 100.0):
-        found, plain = balanced(SIX, [[0.4 * load, 0, -load]], item=item, torque_about="taxel")
-        np.testing.assert_allclose(found[:, 2], -load / 6, rtol=1e-12)
-        np.testing.assert_allclose(found[:, [0, 1, 5]], plain[:, [0, 1, 5]], rtol=1e-12)
-        assert (np.abs(found[:, [0, 5]]) > 1e-4).all()
+        readings, plain = balanced(SIX, [[0.4 * load, 0, -load]], item=item, torque_about="taxel")
+        np.testing.assert_allclose(readings[:, 2], -load / 6, rtol=1e-12)
+        np.testing.assert_allclose(readings[:, [0, 1, 5]], plain[:, [0, 1, 5]], rtol=1e-12)
+        assert (np.abs(readings[:, [0, 5]]) > 1e-4).all()
 
 
-def test_a_contact_without_friction_has_none_when_balanced():
-    found, _ = balanced(SIX, [[0, 0, -2.0]], item=DRAGGED, torque_about="taxel")
-    np.testing.assert_allclose(found, [[0, 0, -2.0 / 6, 0, 0, 0]] * 6, rtol=1e-12, atol=1e-15)
+def test_balancing_adds_no_friction_to_a_frictionless_contact():
+    readings, _ = balanced(SIX, [[0, 0, -2.0]], item=DRAGGED, torque_about="taxel")
+    np.testing.assert_allclose(readings, [[0, 0, -2.0 / 6, 0, 0, 0]] * 6, rtol=1e-12, atol=1e-15)
 
 
-def test_a_friction_cone_limits_balanced_friction_in_the_solvers_place():
+def test_a_friction_cone_replaces_the_solvers_limit():
     """μ times the balanced normal force, whether the solver's friction is larger or smaller."""
     for shear in (0.0, 5.0):
-        found, plain = balanced(SIX, [[shear, 0, -2.0]], item=DRAGGED, friction_cone=0.3, torque_about="taxel")
+        readings, plain = balanced(SIX, [[shear, 0, -2.0]], item=DRAGGED, friction_cone=0.3, torque_about="taxel")
         along = plain[:, :2] / np.linalg.norm(plain[:, :2], axis=1)[:, None]
-        np.testing.assert_allclose(found[:, :2], 0.3 * 2.0 / 6 * along, rtol=1e-12)
-        np.testing.assert_allclose(found[:, 5], 0.01 * 0.3 * 2.0 / 6, rtol=1e-12)
+        np.testing.assert_allclose(readings[:, :2], 0.3 * 2.0 / 6 * along, rtol=1e-12)
+        np.testing.assert_allclose(readings[:, 5], 0.01 * 0.3 * 2.0 / 6, rtol=1e-12)
 
 
-def test_taxels_that_pull_leave_the_others_their_share():
-    """A box that turns about its middle: it approaches on one side and leaves on the other, fast enough to pull there.
+def test_pulling_taxels_leave_the_others_their_share():
+    """A box turning about its middle approaches on one side and leaves on the other, fast enough to pull there.
 
-    By the law the two sides cancel but for a rest, and to be scaled to the solver's force this rest would be divided by.
+    By the law the two sides cancel except for a remainder; scaling to the solver's force would divide by it.
     """
     two, roll = [(-0.01, 0, 0), (0.01, 0, 0)], {**ABOVE, "angvel": [0, 1e5, 0]}
-    found, plain = balanced(two, [[0, 0, -2.0]], item=roll, outputs=["force"])
+    readings, plain = balanced(two, [[0, 0, -2.0]], item=roll, outputs=["force"])
     pulls = plain[:, 2] > 0
     assert pulls.sum() == 1
     assert abs(plain[:, 2].sum()) < 1.1 * 2 * 500 * S
-    np.testing.assert_allclose(found[pulls], 0, atol=1e-15)
-    np.testing.assert_allclose(found[~pulls], [[0, 0, -2.0]], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(readings[pulls], 0, atol=1e-15)
+    np.testing.assert_allclose(readings[~pulls], [[0, 0, -2.0]], rtol=1e-12, atol=1e-15)
 
 
-def pressed_by_hand(tmp_path, depth, load, friction, dtype, **sensor):
-    """Return the readings' planes of two taxels at given depths [m], sliding and spinning, under a load with friction [N]."""
+def readings_by_hand(tmp_path, depth, load, friction, dtype, **sensor):
+    """Return the readings of two taxels at given depths [m], sliding and spinning, under a load with friction [N]."""
     touch = module(tmp_path, [(0, 0, 0), (0.01, 0, 0)], BOX, dtype=dtype, kind="kinematic_taxel", balance="solver", **sensor)
     constants = touch.constants.tree["sensors"]["s"]
-    none, one = torch.zeros_like(depth), torch.ones_like(depth)
+    zero, one = torch.zeros_like(depth), torch.ones_like(depth)
     at = torch.zeros(1, 1, 1, dtype=dtype)
     down, away = (at, at, at - 1), (at, at, at)
     contacts = ContactPoints(away, (at + friction, at, at - load), away, down, (at[0], at[0], at[0]))
-    velocity, angular = (0.1 * one, -0.2 * one, none), (none, none, 5 * one)
+    velocity, angular = (0.1 * one, -0.2 * one, zero), (zero, zero, 5 * one)
     pos = vec(touch.constants["quantities/contact_depth/queries/0/pos"])
-    felt = Penetration(pos, depth, (none, none, -one), velocity, angular, {}, {})
-    gathered = Gathered({ContactDepth: felt, Contacts: contacts})
+    penetration = Penetration(pos, depth, (zero, zero, -one), velocity, angular, {}, {})
+    gathered = Gathered({ContactDepth: penetration, Contacts: contacts})
     return KINEMATIC_TAXEL.forward(gathered, UNTIMED, constants, LoopState())[0]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("cone", [{}, {"friction_cone": 0.7}], ids=["solver", "cone"])
-def test_nothing_grows_as_depth_vanishes(tmp_path, dtype, cone):
-    """Over 12 decades of depth the readings stay within the solver's force, and derivatives are finite.
+def test_readings_stay_bounded_as_depth_vanishes(tmp_path, dtype, cone):
+    """Over 12 decades of depth readings stay within the solver's force, and derivatives are finite.
 
-    Down to 1 nm the normal forces sum to the solver's; the load that a lesser depth has in the law counts as none.
+    Down to 1 nm the normal forces sum to the solver's; the load at smaller depths counts as none.
     """
     load, friction = 3.0, 0.5
     limit = 0.7 * load if cone else friction
     for exponent in range(-3, -16, -1):
         depth = torch.tensor([[10.0**exponent, 0.5 * 10.0**exponent]], dtype=dtype, requires_grad=True)
         sizes = torch.tensor([load, friction], dtype=dtype, requires_grad=True)
-        found = pressed_by_hand(tmp_path, depth, sizes[0], sizes[1], dtype, torque_about="taxel", **cone)
-        normal, shear = -found["force_z"], torch.hypot(found["force_x"], found["force_y"])
+        readings = readings_by_hand(tmp_path, depth, sizes[0], sizes[1], dtype, torque_about="taxel", **cone)
+        normal, shear = -readings["force_z"], torch.hypot(readings["force_x"], readings["force_y"])
         share = torch.tensor([1.0, 0.5**1.2], dtype=dtype) / (1 + 0.5**1.2)
         if exponent >= -9:
             torch.testing.assert_close(normal[0], load * share, rtol=1e-5, atol=0)
         assert (normal >= 0).all()
         assert (normal[0] <= load * share * (1 + 1e-5)).all()
         assert (shear[0] <= limit * share * (1 + 1e-5)).all()
-        assert (found["torque_z"].abs()[0] <= 0.01 * limit * share * (1 + 1e-5)).all()
-        total = sum(plane.sum() for plane in found.values())
+        assert (readings["torque_z"].abs()[0] <= 0.01 * limit * share * (1 + 1e-5)).all()
+        total = sum(plane.sum() for plane in readings.values())
         for gradient in torch.autograd.grad(total, [depth, sizes], allow_unused=True):
             assert gradient is None or torch.isfinite(gradient).all()
 
 
-def test_the_solvers_normal_is_the_contacts_own():
+def test_the_solvers_normal_is_the_contacts():
     tilted = np.array([0.6, 0, -0.8])
-    found, _ = balanced([(0, 0, 0)], [(3 * tilted + [0.08, 0.3, 0.06]).tolist()], [tilted.tolist()])
-    np.testing.assert_allclose(found[0, :3], [0, 0, -3], atol=1e-12)  # along the taxel's normal
+    readings, _ = balanced([(0, 0, 0)], [(3 * tilted + [0.08, 0.3, 0.06]).tolist()], [tilted.tolist()])
+    np.testing.assert_allclose(readings[0, :3], [0, 0, -3], atol=1e-12)  # along the taxel's normal
 
 
 @pytest.mark.parametrize("item", [{"pos": [0, 0, 0.2]}, {**ABOVE, "linvel": [0, 0, 600]}], ids=["untouched", "pulling"])
-def test_where_no_taxel_is_pressed_the_solvers_force_is_not_carried(item):
-    found, plain = balanced([(0, 0, 0), (0.01, 0, 0)], [[0, 0, -1.0]], item=item)
-    assert not found.any()
+def test_without_a_pressed_taxel_the_solvers_force_is_dropped(item):
+    readings, plain = balanced([(0, 0, 0), (0.01, 0, 0)], [[0, 0, -1.0]], item=item)
+    assert not readings.any()
     assert plain[:, 2].sum() >= 0
 
 
-def test_a_resting_cube_that_is_balanced_weighs_what_it_weighs():
-    """MuJoCo's cube on a pad of probes: 2.4525 N when balanced; by depth alone some other number."""
-    found = kinematic.balanced_weight()
-    assert found.paper_error > 1
+def test_a_balanced_resting_cube_reads_its_weight():
+    """MuJoCo's cube on a pad of probes: 2.4525 N when balanced; depth alone gives another number."""
+    comparison = kinematic.balanced_weight()
+    assert comparison.paper_error > 1
 
 
-def test_a_sliding_cube_that_is_balanced_drags_no_harder_than_the_solver(tmp_path):
-    """MuJoCo's cube on a slippery pad at 0.1 m/s: its weight, and friction along its motion, not above μ of that."""
+def test_a_balanced_sliding_cube_drags_no_harder_than_the_solver(tmp_path):
+    """MuJoCo's cube on a slippery pad at 0.1 m/s: its weight, and friction along its motion of at most μ times that."""
     touch = pad(
         tmp_path, kind="kinematic_taxel", balance="solver", friction=0.3,
         qvel="0.1 0 0 0 0 0", gravity=f"{0.3 * 9.81} 0 -9.81", place="pos='-.008 0 .0299'",
@@ -300,7 +300,7 @@ def test_a_sliding_cube_that_is_balanced_drags_no_harder_than_the_solver(tmp_pat
 @pytest.mark.parametrize("exponent", [0.7, 1.0, 1.2])
 @pytest.mark.parametrize("depth", [0.0, 1e-12, -1e-3, -1.0])
 def test_gradients_are_finite_at_first_touch_and_far_away(tmp_path, exponent, depth):
-    """At d = 0 the law has a vertical tangent for α < 1: its derivative there counts as 0, so that training goes on."""
+    """For α < 1 the law has a vertical tangent at d = 0: its derivative there counts as 0, so that training continues."""
     touch = module(tmp_path, [(0, 0, 0)], BOX, kind="kinematic_taxel", depth_exponent=exponent)
     scene = state(touch, pos=[0, 0, 0.03 - depth], linvel=[0.1, 0, -0.2])
     names = [name for name in touch.inputs.fields if name.startswith("body_")]

@@ -1,4 +1,4 @@
-"""Kinds that installed packages bring, for documents, artefacts, the command line and editors; and what is wrong with some."""
+"""Sensor kinds of installed packages in documents, artefacts, the command line and editors; and broken ones."""
 
 import json
 import os
@@ -78,13 +78,13 @@ def install(tmp_path, monkeypatch):
         yield install
 
 
-def test_a_kind_that_nobody_brings(install, tmp_path):
+def test_a_kind_that_is_not_installed_is_unknown(install, tmp_path):
     assert known_kinds() == KINDS
     with pytest.raises(SpecError, match='unknown kind "inverse"'):
         tgdsl.compile(tmp_path / "hand.yaml")
 
 
-def test_an_installed_kind_is_there_without_being_given(install, tmp_path, here):
+def test_an_installed_kind_is_known_without_being_passed(install, tmp_path, here):
     install("touchy", "1.2", inverse="touchy:INVERSE")
     touch = tgdsl.compile(tmp_path / "hand.yaml")
     state = touch.example_state(3)
@@ -103,8 +103,8 @@ def test_an_installed_kind_is_there_without_being_given(install, tmp_path, here)
     )
 
 
-def test_a_kind_may_be_both_installed_and_given(install, tmp_path):
-    """Its author's own tests give it while it is installed."""
+def test_a_kind_may_be_both_installed_and_passed(install, tmp_path):
+    """Its author's tests pass it while it is installed."""
     install("touchy", "1.2", inverse="touchy:INVERSE", again="touchy:INVERSE")
     import touchy  # type: ignore[import-not-found]
 
@@ -112,7 +112,7 @@ def test_a_kind_may_be_both_installed_and_given(install, tmp_path):
     tgdsl.compile(tmp_path / "hand.yaml", kinds=[touchy.INVERSE])
 
 
-def test_two_kinds_of_one_name(install, tmp_path):
+def test_two_kinds_of_one_name_are_an_error(install, tmp_path):
     install("feely", "0.3", inverse="feely:INVERSE")
     install("touchy", "1.2", inverse="touchy:INVERSE")
     for call in (known_kinds, json_schema, lambda: tgdsl.compile(tmp_path / "hand.yaml")):
@@ -121,7 +121,7 @@ def test_two_kinds_of_one_name(install, tmp_path):
         assert str(caught.value) == 'two kinds are called "inverse": one of feely 0.3, one of touchy 1.2; rename or remove one'
 
 
-def test_a_kind_that_is_given_and_another_that_is_installed(install):
+def test_a_passed_kind_may_not_take_the_name_of_an_installed_one(install):
     install("touchy", "1.2", inverse="touchy:INVERSE")
     import touchy  # type: ignore[import-not-found]
 
@@ -140,13 +140,13 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("case", BROKEN)
-def test_a_kind_that_cannot_be_had_is_left_out_with_a_warning_that_names_its_package(install, case):
-    value, why = BROKEN[case]
+def test_a_broken_kind_is_skipped_with_a_warning_that_names_its_package(install, case):
+    value, reason = BROKEN[case]
     install("touchy", "1.2", broken=value, inverse="touchy:INVERSE")
     with pytest.warns(UserWarning, match="is left out") as caught:
         kinds = known_kinds()
     assert [str(warning.message) for warning in caught] == [
-        f'the sensor kind "broken" of touchy 1.2 ({value}) is left out: {why}'
+        f'the sensor kind "broken" of touchy 1.2 ({value}) is left out: {reason}'
     ]
     assert [kind.name for kind in kinds] == [*(kind.name for kind in KINDS), "inverse"], "the others are there"
     with warnings.catch_warnings():
@@ -154,7 +154,7 @@ def test_a_kind_that_cannot_be_had_is_left_out_with_a_warning_that_names_its_pac
         assert known_kinds() == kinds, "once"
 
 
-def test_a_kind_cannot_take_the_name_of_one_of_ours(install, tmp_path):
+def test_a_kind_may_not_take_the_name_of_a_builtin_one(install, tmp_path):
     install("touchy", "1.2", inverse="touchy:INVERSE")
     (tmp_path / "site_touchy" / "touchy.py").write_text(MODULE.replace('"inverse"]', '"contact"]'))
     with pytest.raises(
@@ -183,16 +183,16 @@ RESERVED = {
 
 
 @pytest.mark.parametrize("case", RESERVED)
-def test_names_that_readings_need_are_refused(install, tmp_path, case):
+def test_names_reserved_for_readings_are_refused(install, tmp_path, case):
     install("touchy", "1.2", inverse="touchy:INVERSE")
-    change, what = RESERVED[case]
+    change, message = RESERVED[case]
     lowered, _, report = change.partition("|")
     text = MODULE.replace('Lowered((Channel("inverse", "1"),)', lowered)
     text = text.replace("reports={}", f'reports={{"{report}}}') if report else text
     (tmp_path / "site_touchy" / "touchy.py").write_text(text)
     with pytest.raises(TgdslError) as caught:
         tgdsl.compile(tmp_path / "hand.yaml")
-    assert str(caught.value) == what
+    assert str(caught.value) == message
 
 
 INHERITED = """
@@ -206,12 +206,12 @@ class TestInverse(KindConformance):
 
 
 @pytest.mark.slow
-def test_the_suite_brings_no_marks_into_other_peoples_pytest(tmp_path):
+def test_the_suite_adds_no_marks_to_other_peoples_pytest(tmp_path):
     (tmp_path / "touchy.py").write_text(MODULE)
     (tmp_path / "test_mine.py").write_text(INHERITED)
     options = ["--collect-only", "--strict-markers", "-W", "error", "-p", "no:cacheprovider", "--rootdir", "."]
     command = [sys.executable, "-m", "pytest", "-q", *options, "test_mine.py"]
-    done = subprocess.run(
+    result = subprocess.run(
         command,
         cwd=tmp_path,
         capture_output=True,
@@ -219,5 +219,5 @@ def test_the_suite_brings_no_marks_into_other_peoples_pytest(tmp_path):
         check=False,
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
     )
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "test_mine.py::TestInverse::test_compiled_equals_eager" in done.stdout
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "test_mine.py::TestInverse::test_compiled_equals_eager" in result.stdout

@@ -1,4 +1,4 @@
-"""What the solver says of each body: the bit, the force, how hard it is pressed, their frame and their order."""
+"""The solver's readings of each body: contact bit, force, pressing force, their frame and their order."""
 
 import numpy as np
 import pytest
@@ -15,17 +15,17 @@ from tgdsl.testing import KindConformance
 
 class TestLinkContact(KindConformance):
     kind = LINK_CONTACT
-    test_compiled_equals_eager = None  # its graph is part of that of all outputs
+    test_compiled_equals_eager = None  # its graph is part of the one of all outputs
     is_differentiable = False
     gates = ()
 
     def test_something_is_felt(self, scene):
-        """Every body of the suite's states has some contact, so every one reads a force."""
+        """Every body of the suite's states has a contact, so each reads a force."""
         module, _ = self.build(self.document(scene), torch.float64)
         assert all((module(state)["s"] != 0).all() for state in self.states(module))
 
     def test_a_broken_pose_is_seen(self, scene):
-        """The link's own pose is all that counts here: its force has no direction, and no contact is not what it reads."""
+        """Only the link's pose matters here: without it the force has no direction, and must not read as no contact."""
         module, _ = self.build(self.document(scene), torch.float32)
         state = module.example_state(2)
         state.body_pos[1], state.body_quat[1] = torch.nan, torch.nan
@@ -40,7 +40,7 @@ class TestLinkContactBit(TestLinkContact):
     test_something_is_felt = KindConformance.test_something_is_felt
 
     def test_no_distance_is_measured(self, scene):
-        """The solver knows already: no geometry reaches the plan, and velocities are not asked for."""
+        """The solver knows the contacts: no geometry reaches the plan, and no velocities are required."""
         plan = self.build(self.document(scene), torch.float32)[0].plan
         assert set(plan.quantities) == {"contacts"} and not any("/geoms/" in name for name in plan.arrays)
         assert plan.inputs.fields == ("body_pos", "body_quat", "contact_netforce")
@@ -52,12 +52,12 @@ class TestLinkContactNormalForce(TestLinkContact):
 
 
 class TestLinkContactNormalForceAlone(KindConformance):
-    """Where all contacts press, as in the suite's states, it is smooth in forces and normals."""
+    """Where all contacts press, as in the suite's states, the reading is smooth in forces and normals."""
 
     kind = LINK_CONTACT
     gates = ()
     parameters = {"outputs": ["normal_force"]}
-    test_compiled_equals_eager = None  # its graph is part of that of all outputs
+    test_compiled_equals_eager = None  # its graph is part of the one of all outputs
 
     test_something_is_felt = TestLinkContact.test_something_is_felt
     test_a_broken_pose_is_seen = TestLinkContact.test_a_broken_pose_is_seen
@@ -95,33 +95,33 @@ def scene(tmp_path):
     return build
 
 
-def resting(touch):
+def resting_readings(touch):
     sim = tgdsl.simulate(touch, 1, substeps=500)
     for _ in range(3):
         sim.step()
     return touch(sim.state())["s"][0].numpy()
 
 
-def test_the_weight_of_what_rests_there_in_the_links_frame(scene):
-    """0.25 and 0.01 kg on the one body, which is turned about its vertical axis, and nothing on the other: one row each."""
+def test_a_resting_weight_is_read_in_the_links_frame(scene):
+    """One row per body: 0.25 and 0.01 kg on a body turned about its vertical axis, nothing on the other."""
     touch = scene()
     (output,) = touch.outputs
     assert output.bodies == ("left", "right")
     assert output.channels == ("contact", "force_x", "force_y", "force_z")
     assert output.units == ("1", "N", "N", "N")
-    np.testing.assert_allclose(resting(touch), [[1, 0, 0, -0.26 * 9.81], [0, 0, 0, 0]], atol=1e-5)
+    np.testing.assert_allclose(resting_readings(touch), [[1, 0, 0, -0.26 * 9.81], [0, 0, 0, 0]], atol=1e-5)
 
 
 @pytest.mark.parametrize(("threshold", "expected"), [(0, [1, 0]), (0.09, [1, 0]), (2.5, [1, 0]), (2.6, [0, 0])])
 def test_threshold(scene, threshold, expected):
-    np.testing.assert_array_equal(resting(scene(outputs=["contact"], threshold=threshold))[:, 0], expected)
+    np.testing.assert_array_equal(resting_readings(scene(outputs=["contact"], threshold=threshold))[:, 0], expected)
 
 
-def test_only_what_it_feels_counts(scene):
-    np.testing.assert_allclose(resting(scene(outputs=["force"], feels=["ball"]))[0], [0, 0, -0.01 * 9.81], atol=1e-5)
+def test_only_felt_objects_count(scene):
+    np.testing.assert_allclose(resting_readings(scene(outputs=["force"], feels=["ball"]))[0], [0, 0, -0.01 * 9.81], atol=1e-5)
 
 
-def test_the_net_force_is_all_that_is_read(scene):
+def test_only_the_net_force_is_required(scene):
     touch = scene()
     assert touch.inputs.fields == ("body_pos", "body_quat", "contact_netforce")
     assert touch.inputs.slots == 0
@@ -142,7 +142,7 @@ def test_a_force_in_the_world_is_read_in_the_links_frame(scene):
 
 
 def world_state(touch, forces, normals):
-    """Return a state in which the right body touches the cube: a force and a normal for each slot, the net force their sum."""
+    """Return a state with the right body touching the cube: a force and a normal per slot; the net force is their sum."""
     state = touch.example_state(1)
     pair = [(pair.link, pair.object) for pair in touch.inputs.pairs].index(("right", "cube"))
     for name in ("contact_force", "contact_torque", "contact_normal", "contact_netforce"):
@@ -158,8 +158,8 @@ SQUEEZE = ([[3.0, 0.4, 0], [-3.0, 0.4, 0]], [[1.0, 0, 0], [-1.0, 0, 0]])
 """Two walls that press with 3 N each, and friction that carries 0.8 N."""
 
 
-def test_normal_forces_that_oppose_one_another_add_up(scene):
-    """The net force of the walls is their friction's; a contact that pulls presses with nothing."""
+def test_opposing_normal_forces_add_up(scene):
+    """The net force of the walls is their friction; a pulling contact does not press."""
     touch = scene(outputs=["force", "normal_force"])
     assert touch.outputs[0].channels == ("force_x", "force_y", "force_z", "normal_force")
     assert touch.outputs[0].units == ("N",) * 4
@@ -171,8 +171,8 @@ def test_normal_forces_that_oppose_one_another_add_up(scene):
     np.testing.assert_allclose(touch(pulled)["s"][0, :, 3], [0, 3], atol=1e-14)
 
 
-def test_a_force_without_a_normal_is_no_number(scene):
-    """As `quantities.contacts` has it: what needs a normal that is not there is not-a-number, the net force is read."""
+def test_a_force_without_a_normal_gives_nan(scene):
+    """As in `quantities.contacts`: the normal force needs the missing normal and is NaN; the net force is read."""
     touch = scene(outputs=["force", "normal_force"])
     state, pair = world_state(touch, *SQUEEZE)
     state.contact_normal[0, pair, 0] = 0
@@ -180,8 +180,8 @@ def test_a_force_without_a_normal_is_no_number(scene):
     assert reading[1, 3].isnan() and not reading[0].isnan().any() and not reading[1, :3].isnan().any()
 
 
-def test_what_slots_lack_is_shared_out(scene):
-    """A flat face of 5 N of which one slot shows 2 N: all normals are the same, and so 5 N are read."""
+def test_force_beyond_the_slots_is_shared_out(scene):
+    """A flat face carries 5 N and its one slot shows 2 N: all normals are equal, so 5 N are read."""
     touch = scene(outputs=["normal_force"], slots=1)
     assert touch.inputs.slots == 1
     state, pair = world_state(touch, [[0, 0, 2.0]], [[0, 0, 1.0]])
@@ -190,13 +190,13 @@ def test_what_slots_lack_is_shared_out(scene):
         np.testing.assert_allclose(touch(state)["s"][0, :, 0], [0, 5], atol=1e-14)
 
 
-def test_slots_are_of_the_normal_force_alone(scene):
+def test_slots_apply_only_to_the_normal_force(scene):
     with pytest.raises(SpecError, match="`slots` is used by the output `normal_force` alone, expected it to be left out"):
         scene(slots=4)
 
 
 def test_noise_acts_on_the_normal_force(scene):
-    """A quantiser of 3.5 N rounds 6.1 N to 7 N and the net force of 0.9 N to none: each channel is a signal by itself."""
+    """A quantiser of 3.5 N rounds 6.1 N to 7 N and the net force of 0.9 N to zero: each channel is a separate signal."""
     touch = scene(outputs=["force", "normal_force"], noise={"quantization": 3.5})
     state, _ = world_state(touch, [[3.0, 0.4, 0], [-3.0, 0.4, 0], [0, 0.1, 0]], [[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0]])
     np.testing.assert_allclose(touch(state)["s"][0], [[0, 0, 0, 0], [0, 0, 0, 7]], atol=1e-13)
@@ -231,7 +231,7 @@ def on_mujoco(touch):
 
 @pytest.mark.parametrize("simulator", [on_mujoco, pytest.param(on_warp, marks=pytest.mark.slow)])
 def test_the_normal_force_of_a_slope_and_of_a_groove(tmp_path, simulator):
-    """The slope takes m g cos θ of a cube's weight, and the groove's walls m g / (2 cos 45°) each of a ball's."""
+    """The slope carries m g cos θ of the cube's weight; each wall of the groove carries m g / (2 cos 45°) of the ball's."""
     (tmp_path / "scene.xml").write_text(GROOVE)
     document = {
         "tgdsl": 1,

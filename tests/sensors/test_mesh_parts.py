@@ -1,4 +1,4 @@
-"""Meshes as files have them, inside out, in parts, open: by either query they read as the solid that they stand for."""
+"""Meshes from files, inverted, in parts or open: by either query they read like the solid that they represent."""
 
 import warnings
 
@@ -14,7 +14,7 @@ from tgdsl.module.state import SceneState
 R = 0.005
 TOLERANCE = 1e-4
 BOUND = {"raycast": 1e-6, "sdf": 5 * TOLERANCE}
-"""Largest error of a distance [m]: MuJoCo has vertices in single precision, and near creases a grid is held to five times its
+"""Largest error of a distance [m]: MuJoCo stores vertices in single precision; near creases a grid is held to five times its
 tolerance."""
 CUBE = (0.04, 0.04, 0.04)
 
@@ -26,7 +26,7 @@ def inverted(mesh):
 
 
 def read(folder, geom, pos, **target):
-    """Readings of probes that face down, all in the frame of the geom, which comes down on them at 10 cm/s."""
+    """Return readings of probes facing down, in the frame of the geom, which descends on them at 10 cm/s."""
     (folder / "scene.xml").write_text(
         '<mujoco><asset><mesh name="item" file="item.stl" inertia="shell"/></asset><worldbody>'
         '<body name="pad"><freejoint/><geom size=".05"/></body><body name="item"><freejoint/>'
@@ -55,7 +55,7 @@ def read(folder, geom, pos, **target):
     quat = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(1, 2, 1)
     moving = rest.clone()
     moving[0, 1, 2] = -0.1
-    return {key: found[0].numpy() for key, found in touch(SceneState(rest, quat, moving, rest)).items()}
+    return {key: values[0].numpy() for key, values in touch(SceneState(rest, quat, moving, rest)).items()}
 
 
 def mesh_read(folder, parts, pos, query):
@@ -84,32 +84,32 @@ CASES = {
         [(0.0, 0, -0.017), (0.001, 0, -0.01)], ".02 .02 .02",
     ),
 }  # fmt: skip
-"""Parts, probes, and half the size of the box that they make together."""
+"""Parts, probes, and half sizes of the box that the parts form."""
 
 
 @pytest.mark.parametrize("query", ["sdf", "raycast"])
 @pytest.mark.parametrize("name", CASES)
-def test_all_sensors_read_the_box_that_parts_make(tmp_path, name, query):
+def test_all_sensors_read_the_box_that_parts_form(tmp_path, name, query):
     parts, pos, half = CASES[name]
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "mesh .* inertia|.*usually at ")
-        found = mesh_read(tmp_path, parts, pos, query)
+        readings = mesh_read(tmp_path, parts, pos, query)
         expected = read(tmp_path, f'<geom type="box" size="{half}" contype="0" conaffinity="0"/>', pos)
     bound = BOUND[query]
-    np.testing.assert_allclose(found["distance"], expected["distance"], rtol=0, atol=bound)
-    np.testing.assert_allclose(found["depth"], expected["depth"], rtol=0, atol=bound)
-    np.testing.assert_array_equal(found["contact"], expected["contact"])
+    np.testing.assert_allclose(readings["distance"], expected["distance"], rtol=0, atol=bound)
+    np.testing.assert_allclose(readings["depth"], expected["depth"], rtol=0, atol=bound)
+    np.testing.assert_array_equal(readings["contact"], expected["contact"])
     assert expected["contact"].all()
     stiffness = np.abs(expected["force"][..., 2]).max() / expected["depth"].max()
-    np.testing.assert_allclose(found["force"], expected["force"], rtol=0, atol=2 * stiffness * bound)
+    np.testing.assert_allclose(readings["force"], expected["force"], rtol=0, atol=2 * stiffness * bound)
 
 
 @pytest.mark.parametrize("query", ["sdf", "raycast"])
-def test_parts_across_each_other_are_deep_inside_both(tmp_path, query):
-    """20 mm in the middle of two cubes 20 mm apart: their faces within each other are no surface."""
+def test_points_in_both_of_two_intersecting_parts_are_deep_inside(tmp_path, query):
+    """The middle of two cubes 20 mm apart is 20 mm deep: faces inside the other cube are no surface."""
     parts = box(CUBE), inverted(box(CUBE, (0.02, 0, 0)))
-    found = mesh_read(tmp_path, parts, [(0.01, 0, 0), (0.0, 0, 0), (0.03, 0, 0.015)], query)
-    np.testing.assert_allclose(found["distance"][:, 0], [-0.02, -0.02, -0.005], rtol=0, atol=BOUND[query])
+    readings = mesh_read(tmp_path, parts, [(0.01, 0, 0), (0.0, 0, 0), (0.03, 0, 0.015)], query)
+    np.testing.assert_allclose(readings["distance"][:, 0], [-0.02, -0.02, -0.005], rtol=0, atol=BOUND[query])
 
 
 @pytest.mark.parametrize("is_inverted", [False, True])
@@ -118,8 +118,8 @@ def test_an_open_mesh_gets_a_lid_and_a_warning(tmp_path, query, is_inverted):
     cup = box(CUBE)
     cup.update_faces(cup.face_normals[:, 2] < 0.5)
     pos = [(0, 0, -0.017), (0, 0, 0.017), (0.001, 0, 0.023)]
-    what = r'^object item: geom "item" is not closed; its winding number decides which points are inside$'
-    with pytest.warns(UserWarning, match=what) as caught:
-        found = mesh_read(tmp_path, [inverted(cup) if is_inverted else cup], pos, query)
+    message = r'^object item: geom "item" is not closed; its winding number decides which points are inside$'
+    with pytest.warns(UserWarning, match=message) as caught:
+        readings = mesh_read(tmp_path, [inverted(cup) if is_inverted else cup], pos, query)
     assert sum("not closed" in str(warning.message) for warning in caught) == 1
-    np.testing.assert_allclose(found["distance"][:, 0], [-0.003, -0.003, 0.003], rtol=0, atol=BOUND[query])
+    np.testing.assert_allclose(readings["distance"][:, 0], [-0.003, -0.003, 0.003], rtol=0, atol=BOUND[query])

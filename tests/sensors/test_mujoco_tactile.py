@@ -1,4 +1,4 @@
-"""Against MuJoCo's own `tactile` sensor, at its own vertices: what it calls penetration is our depth of a point."""
+"""Against MuJoCo's `tactile` sensor, at its vertices: its penetration is our depth of a point."""
 
 import mujoco
 import numpy as np
@@ -19,13 +19,13 @@ def test_depth_at_the_vertices_is_mujocos(shape):
 
 
 OURS, THEIRS, FACETS = 5e-5, 5e-4, 3e-5
-"""Distance errors on a ball of 2 cm [m]: the tolerance that we ask of our grid, what MuJoCo's octree of depth 6 has at most (it
-takes the ball for smaller), and how far the ball's facets are from it."""
+"""Distance errors on a ball of 2 cm [m]: the tolerance of our grid, the largest error of MuJoCo's octree of depth 6 (it
+underestimates the ball), and the distance of the ball's facets from it."""
 
 
 @pytest.mark.slow
-def test_depth_of_a_mesh_is_that_of_mujocos_octree(tmp_path, monkeypatch):
-    """MuJoCo's tactile sensor finds distances to a mesh on an octree, we on a grid: both within their errors of the ball."""
+def test_depth_of_a_mesh_agrees_with_mujocos_octree(tmp_path, monkeypatch):
+    """MuJoCo's tactile sensor measures distances to a mesh on an octree, we on a grid: both within their errors of the ball."""
     monkeypatch.setenv("TGDSL_CACHE", str(tmp_path))
     ball = '<mesh name="ball" builtin="sphere" params="4" scale=".02 .02 .02"/>'
     text = SCENE.format(shape="mesh", size="1").replace("</asset>", f"{ball}</asset>").replace('size="1"', 'mesh="ball"')
@@ -35,8 +35,8 @@ def test_depth_of_a_mesh_is_that_of_mujocos_octree(tmp_path, monkeypatch):
     model = spec.compile()
     data = mujoco.MjData(model)
     pad, patch = model.geom("pad"), model.mesh("patch")
-    own = model.mesh_vert[patch.vertadr[0] : patch.vertadr[0] + patch.vertnum[0]]
-    vertices = Rotation.from_quat(pad.quat, scalar_first=True).apply(own) + pad.pos
+    local = model.mesh_vert[patch.vertadr[0] : patch.vertadr[0] + patch.vertnum[0]]
+    vertices = Rotation.from_quat(pad.quat, scalar_first=True).apply(local) + pad.pos
     points = [{"pos": v.tolist(), "normal": [0, 0, 1], "radius": 5e-3} for v in vertices]
     touch = tgdsl.compile(
         {
@@ -61,10 +61,10 @@ def test_depth_of_a_mesh_is_that_of_mujocos_octree(tmp_path, monkeypatch):
         )
         distance = touch(state)["d"][0, :, 0].numpy()
         theirs = data.sensordata.reshape(3, -1)[0]
-        is_shallow = (distance < 0) & (distance > -5e-3)  # within the band that our grid answers for
+        is_shallow = (distance < 0) & (distance > -5e-3)  # within the band of our grid
         if data.ncon and is_shallow.any():
             centre = data.geom("item").xpos
-            world = data.geom("pad").xpos + own @ data.geom("pad").xmat.reshape(3, 3).T
+            world = data.geom("pad").xpos + local @ data.geom("pad").xmat.reshape(3, 3).T
             depth = 0.02 - np.linalg.norm(world - centre, axis=1)[is_shallow]
             np.testing.assert_allclose(-distance[is_shallow], depth, atol=OURS + FACETS)
             np.testing.assert_allclose(theirs[is_shallow], depth, atol=THEIRS + FACETS)

@@ -1,4 +1,4 @@
-"""All operations that have a kernel: the kernel is their definition, interpreted and on a GPU, and is launched when it can be."""
+"""Operations with kernels: each kernel matches its definition, interpreted and on a GPU, and is launched when possible."""
 
 import ast
 import json
@@ -33,23 +33,23 @@ def operators(file: str) -> set[str]:
 
 def test_each_kernel_belongs_to_an_operation():
     assert len(NAMES) == len(OPERATIONS) and set(NAMES) == EXAMPLES.keys()
-    found = {file: operators(file) & set(NAMES) for file in KERNEL_FILES if file not in LIBRARIES}
-    assert {file for file, names in found.items() if not names} == set()
-    assert sorted(name for names in found.values() for name in names) == sorted(NAMES)
+    names_by_file = {file: operators(file) & set(NAMES) for file in KERNEL_FILES if file not in LIBRARIES}
+    assert {file for file, names in names_by_file.items() if not names} == set()
+    assert sorted(name for names in names_by_file.values() for name in names) == sorted(NAMES)
 
 
 @pytest.mark.parametrize("operation", OPERATIONS, ids=NAMES)
-def test_a_kernel_is_not_taken_on_a_cpu(operation):
+def test_a_cpu_does_not_take_the_kernel(operation):
     example = EXAMPLES[operation.name]
     assert not operation.takes_kernel(*example.arguments(torch.float32))
 
 
-def error_of(name, found, arguments):
-    """Return what is wrong with a result, by the definition in float64."""
+def error_of(name, result, arguments):
+    """Return the error of a result against the definition in float64, as text."""
     example, exact = EXAMPLES[name], EXAMPLES[name].arguments(torch.float64)
     expected = example.compared(OPERATION[name].definition(*exact), exact)
-    found = example.compared(found, arguments)
-    for i, (part, other, tolerance) in enumerate(zip(found, expected, example.tolerances, strict=True)):
+    result = example.compared(result, arguments)
+    for i, (part, other, tolerance) in enumerate(zip(result, expected, example.tolerances, strict=True)):
         if not other.double().abs().max() > 20 * tolerance:
             return f"part {i} is nothing"
         if not (part.double() - other.double()).abs().max() <= tolerance:
@@ -58,7 +58,7 @@ def error_of(name, found, arguments):
 
 
 def interpret(name):
-    """Compare an interpreted kernel with the definition."""
+    """Return the error of an interpreted kernel."""
     use_kernels()
     arguments = EXAMPLES[name].arguments(torch.float32)
     return error_of(name, OPERATION[name](*arguments), arguments)
@@ -69,11 +69,11 @@ def assemble(name):
     assembled = assemble_kernels()
     (kernel,) = (Path(file).stem for file in KERNEL_FILES if name in operators(file))
     OPERATION[name](*EXAMPLES[name].arguments(torch.float32))
-    return "" if any(own.startswith(kernel) for own in assembled) else f"no {kernel} among {assembled}"
+    return "" if any(compiled.startswith(kernel) for compiled in assembled) else f"no {kernel} among {assembled}"
 
 
 def trace(name):
-    """Return "" if one graph of Dynamo holds the operator, whatever the device."""
+    """Return "" if one Dynamo graph contains the operator, on any device."""
     use_kernels()
     operators = []
 
@@ -91,17 +91,17 @@ def trace(name):
 
 
 def launch(name, is_compiled):
-    """Compare a GPU's kernel with the definition, and look whether it was launched."""
+    """Return the error of a GPU's kernel, or that it was not launched."""
     arguments = mapped(torch.Tensor.cuda, EXAMPLES[name].arguments(torch.float32))
     torch.compiler.reset()
     call = torch.compile(OPERATION[name], fullgraph=True) if is_compiled else OPERATION[name]
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
-        found = call(*arguments)
+        result = call(*arguments)
         torch.cuda.synchronize()
     (kernel,) = (Path(file).stem for file in KERNEL_FILES if name in operators(file))
     if not any(event.key.startswith(kernel) for event in profile.key_averages()):
         return f"no {kernel} among {[event.key for event in profile.key_averages()]}"
-    return error_of(name, mapped(torch.Tensor.cpu, found), mapped(torch.Tensor.cpu, arguments))
+    return error_of(name, mapped(torch.Tensor.cpu, result), mapped(torch.Tensor.cpu, arguments))
 
 
 MODES = {
@@ -115,25 +115,25 @@ MODES = {
 
 @pytest.fixture(scope="module")
 def errors():
-    """Return what is wrong in a mode, by the operations' names: one process for all of them."""
+    """Return a function of a mode that returns its errors by operation: one process for all of them."""
 
     @cache
-    def of(mode):
+    def errors_of_mode(mode):
         return json.loads((interpreted if mode == "interpret" else as_script)(__file__, mode))
 
-    return of
+    return errors_of_mode
 
 
 @needs_triton
 @pytest.mark.parametrize("name", NAMES)
-def test_an_interpreted_kernel_is_the_definition(errors, name):
+def test_an_interpreted_kernel_matches_its_definition(errors, name):
     assert errors("interpret")[name] == ""
 
 
 @pytest.mark.slow
 @needs_triton
 @pytest.mark.parametrize("name", NAMES)
-def test_a_kernel_compiles_for_a_gpu_that_is_not_here(errors, name):
+def test_a_kernel_compiles_for_an_absent_gpu(errors, name):
     assert errors("assemble")[name] == ""
 
 
@@ -148,12 +148,12 @@ def test_one_graph_launches_the_kernel(errors, name):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("mode", ["eager", "compiled"])
-def test_a_gpu_launches_the_kernel_and_it_is_the_definition(errors, mode, name):
+def test_a_gpu_launches_the_kernel_and_matches_the_definition(errors, mode, name):
     assert errors(mode)[name] == ""
 
 
 def main() -> None:
-    """Print what is wrong with each operation."""
+    """Print the error of each operation."""
     with torch.no_grad():
         print(json.dumps({name: MODES[sys.argv[1]](name) for name in NAMES}))
 

@@ -10,7 +10,7 @@ from tgdsl.sensors.elastomer import point_anchors
 from tgdsl.sensors.elastomer.point_anchors import Markers, ShearLoad, active_points, are_compacted, block_size
 
 FALLOFF, NUM_MARKERS, TAXELS = 2000.0, 11, ((6, 10), (0, 6), (10, 10))
-"""Markers of three links, of which one has none; the last marker is of no link."""
+"""Markers of three links, one of which has none; the last marker belongs to no link."""
 CASES = {
     # environments, points, share of active points in each environment in turn
     "few": (40, 500, (0.05, 0.2, 0.0)),
@@ -24,8 +24,8 @@ CASES = {
 }
 
 
-def given(name: str, dtype: torch.dtype = torch.float64) -> tuple[ShearLoad, Markers]:
-    """Return active points in runs, and markers with normals all around."""
+def inputs(name: str, dtype: torch.dtype = torch.float64) -> tuple[ShearLoad, Markers]:
+    """Return active points in runs, and markers with normals in all directions."""
     num_envs, num_points, shares = CASES[name]
     rng = np.random.default_rng(num_points)
     pos = 0.02 * rng.normal(size=(3, num_envs, 3, num_points))
@@ -44,17 +44,17 @@ def given(name: str, dtype: torch.dtype = torch.float64) -> tuple[ShearLoad, Mar
     return load, Markers(planes(marker), planes(normal), torch.tensor(FALLOFF, dtype=dtype), None)
 
 
-def printed(load: ShearLoad, markers: Markers) -> np.ndarray:
+def printed_sum(load: ShearLoad, markers: Markers) -> np.ndarray:
     """Return Σ_p s_p exp(−λ |Π_nj(x_j − z_p)|²), (3, env, marker), marker by marker."""
     z, s = (np.stack([part.double().numpy() for part in vector]) for vector in (load.pos, load.strength))
     x, n = (np.stack([part.double().numpy() for part in vector]) for vector in (markers.pos, markers.normal))
-    found = np.zeros((3, z.shape[1], NUM_MARKERS))
+    sums = np.zeros((3, z.shape[1], NUM_MARKERS))
     for link, (first, last) in enumerate(load.taxels):
         for j in range(first, last):
             r = x[:, j, None, None] - z[:, :, link]
             r = r - np.einsum("k,kep->ep", n[:, j], r) * n[:, j, None, None]
-            found[:, :, j] = (s[:, :, link] * np.exp(-FALLOFF * (r**2).sum(axis=0))).sum(axis=2)
-    return found
+            sums[:, :, j] = (s[:, :, link] * np.exp(-FALLOFF * (r**2).sum(axis=0))).sum(axis=2)
+    return sums
 
 
 def summed(load: ShearLoad, markers: Markers) -> torch.Tensor:
@@ -63,53 +63,53 @@ def summed(load: ShearLoad, markers: Markers) -> torch.Tensor:
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-13), (torch.float32, 1e-6)])
 @pytest.mark.parametrize("name", CASES)
-def test_the_sum_is_as_printed(name, dtype, tolerance):
-    load, markers = given(name, dtype)
-    expected = printed(load, markers)
+def test_the_sum_matches_the_printed_one(name, dtype, tolerance):
+    load, markers = inputs(name, dtype)
+    expected = printed_sum(load, markers)
     assert are_compacted(load.pos, load.strength)
     assert (np.abs(expected).max(initial=0) > 0) == (name not in ("none", "no environment"))
     np.testing.assert_allclose(summed(load, markers), expected, rtol=0, atol=tolerance * np.abs(expected).max(initial=0))
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_every_point_that_pulls_is_in_one_slot_of_its_environment(name):
-    load, _ = given(name)
+def test_every_active_point_is_in_one_slot_of_its_environment(name):
+    load, _ = inputs(name)
     for link, (points, env) in enumerate(active_points(load.pos, load.strength)):
         assert points.shape[1] == len(env) >= min(2, len(load.pos[0]))
-        own = env[:, None].expand(points.shape[1:]).reshape(-1)
-        slots = torch.cat([own[None].double(), points.flatten(1)])[:, (points[3:] != 0).any(dim=0).flatten()].T.tolist()
-        everyone = torch.stack([part[:, link] for part in (*load.pos, *load.strength)], dim=-1)
-        wanted = [[float(e), *everyone[e, p].tolist()] for e, p in everyone[..., 3:].any(dim=-1).nonzero().tolist()]
-        assert sorted(slots) == sorted(wanted)
+        slot_envs = env[:, None].expand(points.shape[1:]).reshape(-1)
+        slots = torch.cat([slot_envs[None].double(), points.flatten(1)])[:, (points[3:] != 0).any(dim=0).flatten()].T.tolist()
+        all_points = torch.stack([part[:, link] for part in (*load.pos, *load.strength)], dim=-1)
+        expected = [[float(e), *all_points[e, p].tolist()] for e, p in all_points[..., 3:].any(dim=-1).nonzero().tolist()]
+        assert sorted(slots) == sorted(expected)
 
 
 def test_few_points_take_few_slots():
-    """In blocks of 10, runs of 5 % and 20 % of 500 points touch 4 and 11 blocks at most: far from all 50."""
-    load, _ = given("few")
+    """In blocks of 10, runs of 5 % and 20 % of 500 points touch at most 4 and 11 of the 50 blocks."""
+    load, _ = inputs("few")
     assert block_size(500) == 10 and block_size(101) == 1
     for points, _ in active_points(load.pos, load.strength):
         assert points[0].numel() < 0.3 * load.pos[0][:, 0].numel()
 
 
-def test_not_a_number_comes_out_of_its_own_environment():
-    """Of a pose, though no point is active, and of a strength in its own component."""
-    load, markers = given("few")
+def test_nan_stays_in_its_environment():
+    """A NaN in a pose, though no point is active, and one in a strength, in its component."""
+    load, markers = inputs("few")
     assert not load.strength[0][2, 1].any()
     load.pos[1][2, 1] = torch.nan
     load.strength[2][4, 0, 13] = torch.nan
-    found = summed(load, markers).isnan()
-    assert found[:, 2, :6].all() and found[2, 4, 6:10].all()
-    found[:, 2, :6] = found[2, 4, 6:10] = False
-    assert not found.any()
+    is_nan = summed(load, markers).isnan()
+    assert is_nan[:, 2, :6].all() and is_nan[2, 4, 6:10].all()
+    is_nan[:, 2, :6] = is_nan[2, 4, 6:10] = False
+    assert not is_nan.any()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("num_threads", [1, 2])
 def test_one_graph_serves_all_numbers_of_active_points(num_threads):
-    """Compiled without a break, and not again when other points are active."""
+    """It compiles without a break, and does not recompile when other points are active."""
     torch.compiler.reset()
     compiled = torch.compile(summed, fullgraph=True, dynamic=True)
-    load, markers = given("few", torch.float32)
+    load, markers = inputs("few", torch.float32)
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(num_threads)
@@ -117,16 +117,18 @@ def test_one_graph_serves_all_numbers_of_active_points(num_threads):
         with torch._dynamo.config.patch(error_on_recompile=True):
             for seed in range(4):
                 share = torch.rand(40, 3, 1, generator=torch.Generator().manual_seed(seed)) ** 4 * (seed > 0)
-                own = load._replace(strength=vec(torch.where(torch.arange(500) < 500 * share, 1e-7, 0.0) for _ in range(3)))
-                expected = printed(own, markers)
-                np.testing.assert_allclose(compiled(own, markers), expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+                random_load = load._replace(
+                    strength=vec(torch.where(torch.arange(500) < 500 * share, 1e-7, 0.0) for _ in range(3))
+                )
+                expected = printed_sum(random_load, markers)
+                np.testing.assert_allclose(compiled(random_load, markers), expected, rtol=0, atol=1e-6 * np.abs(expected).max())
     finally:
         torch.set_num_threads(threads)
 
 
-def test_derivatives_are_those_of_the_sum_over_all_points():
-    """Whoever asks for derivatives gets them of every point, of those too that are not active yet."""
-    load, markers = given("two environments")
+def test_derivatives_equal_those_of_the_sum_over_all_points():
+    """With gradients every point counts, even one that is not active yet."""
+    load, markers = inputs("two environments")
     leaves = [part.clone().requires_grad_() for part in (*load.pos, *load.strength)]
 
     def read(*parts):
@@ -137,11 +139,14 @@ def test_derivatives_are_those_of_the_sum_over_all_points():
         assert are_compacted(vec(leaves[:3]), vec(leaves[3:]))
     gradient = torch.autograd.grad(read(*leaves)[0].sum(), leaves)
     assert (gradient[3][:, :2] > 0).all()
-    step, way = 1e-6, [torch.randn(part.shape, generator=torch.Generator().manual_seed(0)).double() for part in leaves[:3]]
+    step, direction = (
+        1e-6,
+        [torch.randn(part.shape, generator=torch.Generator().manual_seed(0)).double() for part in leaves[:3]],
+    )
     with torch.no_grad():
         ahead, behind = (
-            read(*(part + sign * step * w for part, w in zip(leaves, way, strict=False)), *leaves[3:])[0].sum()
+            read(*(part + sign * step * w for part, w in zip(leaves, direction, strict=False)), *leaves[3:])[0].sum()
             for sign in (1, -1)
         )
-    slope = sum(float((g * w).sum()) for g, w in zip(gradient, way, strict=False))
+    slope = sum(float((g * w).sum()) for g, w in zip(gradient, direction, strict=False))
     assert float(ahead - behind) / (2 * step) == pytest.approx(slope, rel=1e-6)

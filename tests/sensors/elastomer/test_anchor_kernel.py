@@ -1,4 +1,4 @@
-"""The Triton kernel by which points take hold of links, run on the CPU by Triton's interpreter, against the torch code."""
+"""The Triton kernel of anchors of points, interpreted on the CPU, against the torch code."""
 
 import json
 from pathlib import Path
@@ -21,13 +21,13 @@ STICKS, SLIDES = StickSlip(1e-3, 1e-5, 1e-3, None), StickSlip(1e-3, 1e-5, 1e-3, 
 CONTACT_LAWS = {"sticks": STICKS, "slides": SLIDES}
 CASES = ("one link", "cubes", "many points")
 STEPS, BEFORE = 4, 7
-"""Steps of a run, and how many points of other objects stand before those that are looked at."""
+"""Steps of a run, and the number of other objects' points that precede the compared ones."""
 PLACE, STRENGTH = 3e-7, 3e-9
 """Errors of places [m], and of their products with depths [m²], in float32."""
 
 
 def moved(meeting, step):
-    """Return a meeting whose object has moved on; at the third step links that were felt no longer are."""
+    """Return a meeting whose object has moved on; at the third step some links are no longer felt."""
     pairs = meeting.pairs
     angle = torch.tensor(0.02 * step, dtype=pairs.offset[0].dtype)
     x, y, z = pairs.offset
@@ -42,19 +42,19 @@ def moved(meeting, step):
     return meeting._replace(pairs=pairs._replace(rotation=rot(turn), offset=offset, gate=gate))
 
 
-def of(stick_slip, dtype):
-    """Return its numbers as a module has them."""
+def to_dtype(stick_slip, dtype):
+    """Return the law's numbers as a module has them."""
     return StickSlip(*(None if part is None else torch.tensor(part, dtype=torch.float32).to(dtype) for part in stick_slip))
 
 
-def nothing_held(meeting):
-    """Return the state of points that hold nothing, those of other objects before them."""
+def free_state(meeting):
+    """Return the state of points that hold nothing, after that of other objects' points."""
     num = meeting.source.pair.shape[0] * meeting.source.points[0].shape[2]
     return {name: torch.cat([torch.full((NUM_ENVS, BEFORE), 9.0), torch.zeros(NUM_ENVS, num)], dim=1) for name in PLANES}
 
 
-def by_kernel(meeting, stick_slip, state):
-    """Return the active points, and change the state in place, as `shear_loads` has the kernel do on a GPU."""
+def advance_by_kernel(meeting, stick_slip, state):
+    """Return the active points and advance the state in place, as `shear_loads` does by the kernel on a GPU."""
     from tgdsl.quantities.depth_kernel import grid_tables
     from tgdsl.sensors.elastomer.anchor_kernel import advance_anchors
 
@@ -66,96 +66,96 @@ def by_kernel(meeting, stick_slip, state):
 
 
 def first_ones(count, num_points):
-    """Return which columns of (env, link, point) hold an active point."""
+    """Return a mask of the columns of (env, link, point) that hold an active point."""
     return torch.arange(num_points) < count[..., None]
 
 
 def check(case, stick_slip):
-    """Make some steps, and compare each with the torch code in float64 from the same anchors.
+    """Run some steps, and compare each with the torch code in float64 from the same anchors.
 
     Returns how many points took hold, let go, slid and pulled.
     """
     exact, meeting = made(case, torch.float64), made(case, torch.float32)
-    state, seen = nothing_held(meeting), torch.zeros(4)
+    state, totals = free_state(meeting), torch.zeros(4)
     for step in range(STEPS):
-        before = {name: plane[:, BEFORE:].double() for name, plane in state.items()}
-        (load,), expected = advance([link_points(moved(exact, step))], of(stick_slip, torch.float64), before)
-        found, count = by_kernel(moved(meeting, step), of(stick_slip, torch.float32), state)
+        previous = {name: plane[:, BEFORE:].double() for name, plane in state.items()}
+        (load,), expected = advance([link_points(moved(exact, step))], to_dtype(stick_slip, torch.float64), previous)
+        active, count = advance_by_kernel(moved(meeting, step), to_dtype(stick_slip, torch.float32), state)
         for name, plane in state.items():
             assert (plane[:, :BEFORE] == 9).all()
             torch.testing.assert_close(plane[:, BEFORE:].double(), expected[name], rtol=0, atol=PLACE)
         is_active = torch.stack(load.strength).ne(0).any(dim=0)
         assert torch.equal(count, is_active.sum(dim=-1)), (case, step)
-        apart = (
-            found[:, first_ones(count, is_active.shape[2])].double() - torch.stack([*load.pos, *load.strength])[:, is_active]
+        error = (
+            active[:, first_ones(count, is_active.shape[2])].double() - torch.stack([*load.pos, *load.strength])[:, is_active]
         ).abs()
-        assert not apart.numel() or (apart[:3].max() <= PLACE and apart[3:].max() <= STRENGTH), (case, step)
-        held, after = before["held"] > 0, expected["held"] > 0
-        dragged = held & after & (expected["anchor_x"] != before["anchor_x"])
-        seen += torch.stack([part.sum() for part in (after & ~held, held & ~after, dragged, is_active)])
-    return seen
+        assert not error.numel() or (error[:3].max() <= PLACE and error[3:].max() <= STRENGTH), (case, step)
+        held, after = previous["held"] > 0, expected["held"] > 0
+        dragged = held & after & (expected["anchor_x"] != previous["anchor_x"])
+        totals += torch.stack([part.sum() for part in (after & ~held, held & ~after, dragged, is_active)])
+    return totals
 
 
 def check_strange_poses():
-    """A pose that is not a number comes out, gated or not, is not remembered, and is in no other link or environment."""
-    meeting, stick_slip = made("cubes", torch.float32), of(SLIDES, torch.float32)
-    state = nothing_held(meeting)
+    """A NaN in a pose is returned, gated or not, is not remembered, and reaches no other link or environment."""
+    meeting, stick_slip = made("cubes", torch.float32), to_dtype(SLIDES, torch.float32)
+    state = free_state(meeting)
     for step in range(2):
-        by_kernel(moved(meeting, step), stick_slip, state)
+        advance_by_kernel(moved(meeting, step), stick_slip, state)
     num_points = meeting.source.points[0].shape[2]
-    clean, count = by_kernel(moved(meeting, 1), stick_slip, {name: plane.clone() for name, plane in state.items()})
-    own, others = slice(BEFORE, BEFORE + num_points), torch.ones(count.shape, dtype=torch.bool)
-    others[2, 0] = False
+    clean, count = advance_by_kernel(moved(meeting, 1), stick_slip, {name: plane.clone() for name, plane in state.items()})
+    points, unaffected = slice(BEFORE, BEFORE + num_points), torch.ones(count.shape, dtype=torch.bool)
+    unaffected[2, 0] = False
     for gate in (0.0, -torch.inf, torch.nan):
         broken, after = moved(meeting, 1), {name: plane.clone() for name, plane in state.items()}
         pair = int(broken.source.pair[0])
         broken.pairs.offset[1][2, pair], broken.pairs.gate[2, pair] = torch.nan, gate
-        found, told = by_kernel(broken, stick_slip, after)
-        assert told[2, 0] == num_points and found[0, 2, 0].isnan().all()
+        result, num_active = advance_by_kernel(broken, stick_slip, after)
+        assert num_active[2, 0] == num_points and result[0, 2, 0].isnan().all()
         for name, plane in after.items():
-            expected = state[name][2, own] if gate != -torch.inf else torch.zeros(num_points)
-            assert torch.equal(plane[2, own], expected) or name != "held"
-        assert torch.equal(told[others], count[others])
-        is_active = first_ones(told, num_points) & others[..., None]
-        assert torch.equal(found[:, is_active], clean[:, is_active])
+            expected = state[name][2, points] if gate != -torch.inf else torch.zeros(num_points)
+            assert torch.equal(plane[2, points], expected) or name != "held"
+        assert torch.equal(num_active[unaffected], count[unaffected])
+        is_active = first_ones(num_active, num_points) & unaffected[..., None]
+        assert torch.equal(result[:, is_active], clean[:, is_active])
 
 
 def check_sums():
-    """A module's own way by both kernels moves the markers as the torch code does."""
+    """A module's path through both kernels moves the markers like the torch code."""
     meeting, exact = made("cubes", torch.float32), made("cubes", torch.float64)
-    state = {name: plane[:, BEFORE:].contiguous() for name, plane in nothing_held(meeting).items()}
+    state = {name: plane[:, BEFORE:].contiguous() for name, plane in free_state(meeting).items()}
     places = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0.6, 0, 0.8]], dtype=torch.float64)
     numbers = torch.tensor([2000.0, 6e-6], dtype=torch.float64)
     for step in range(3):
-        before = {name: plane.double() for name, plane in state.items()}
-        loads, _ = advance([link_points(moved(exact, step))], of(SLIDES, torch.float64), before)
+        previous = {name: plane.double() for name, plane in state.items()}
+        loads, _ = advance([link_points(moved(exact, step))], to_dtype(SLIDES, torch.float64), previous)
         markers = point_anchors.Markers(vec(0.003 * places.T), vec(places.T), *numbers)
         expected = torch.stack(point_anchors.drag(loads, markers, NUM_ENVS))
-        loads, after = SHEAR_LOADS([moved(meeting, step)], of(SLIDES, torch.float32), state)
+        loads, after = SHEAR_LOADS([moved(meeting, step)], to_dtype(SLIDES, torch.float32), state)
         markers = point_anchors.Markers(vec(0.003 * places.T.float()), vec(places.T.float()), *numbers.float())
-        found = torch.stack(point_anchors.drag(loads, markers, NUM_ENVS))
+        displacement = torch.stack(point_anchors.drag(loads, markers, NUM_ENVS))
         assert after == {} and (step != 1 or expected.abs().max() > 1e-9)
-        torch.testing.assert_close(found.double(), expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
+        torch.testing.assert_close(displacement.double(), expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
 
 
 def compare() -> None:
-    """Make all comparisons: run where `TRITON_INTERPRET` is set."""
+    """Make all comparisons; `TRITON_INTERPRET` must be set."""
     use_kernels()
     for stick_slip in CONTACT_LAWS.values():
-        seen = torch.stack([check(case, stick_slip) for case in CASES]).sum(dim=0)
-        assert (seen[[0, 1, 3]] > 10).all() and (seen[2] > 10) == (stick_slip.slip is not None), seen
+        totals = torch.stack([check(case, stick_slip) for case in CASES]).sum(dim=0)
+        assert (totals[[0, 1, 3]] > 10).all() and (totals[2] > 10) == (stick_slip.slip is not None), totals
     check_strange_poses()
     check_sums()
 
 
 @pytest.mark.slow
 @needs_triton
-def test_the_kernel_is_the_torch_code():
+def test_the_kernel_matches_the_torch_code():
     interpreted(__file__)
 
 
-def test_a_distance_is_less_than_a_cell_below_that_of_the_next_node():
-    """By this the kernel passes over points; half a cell's diagonal is 0.87 cells, the rest is for what interpolation adds."""
+def test_a_distance_is_less_than_a_cell_below_the_next_nodes():
+    """The kernel skips points by this bound: half a cell's diagonal is 0.87 cells, the rest allows for interpolation."""
     sensor = {"kind": "elastomer", "links": "hand", "feels": ["cube"], "anchors": "points", "points": 50}
     touch = tgdsl.compile(PALM, resolution="low", overrides={"sensors": json.dumps({"s": sensor}), "observations": "{}"})
     (shape,), below = touch.plan.quantities["points"].surfaces.shapes, []
@@ -173,14 +173,14 @@ def test_a_distance_is_less_than_a_cell_below_that_of_the_next_node():
 
 
 @pytest.mark.parametrize("stick_slip", CONTACT_LAWS)
-def test_without_a_kernel_all_objects_are_advanced_by_torch(stick_slip):
-    """Of links with several meshes too."""
+def test_without_a_kernel_torch_advances_all_objects(stick_slip):
+    """Links with several meshes too."""
     for case in ("cubes", "several meshes"):
         meeting = made(case, torch.float64)
-        state = {name: plane[:, BEFORE:].double() for name, plane in nothing_held(meeting).items()}
-        (load,), after = shear_loads([meeting], of(CONTACT_LAWS[stick_slip], torch.float64), state)
-        (expected,), wanted = advance([link_points(meeting)], of(CONTACT_LAWS[stick_slip], torch.float64), state)
-        assert load.count is None and all(torch.equal(after[name], wanted[name]) for name in PLANES)
+        state = {name: plane[:, BEFORE:].double() for name, plane in free_state(meeting).items()}
+        (load,), after = shear_loads([meeting], to_dtype(CONTACT_LAWS[stick_slip], torch.float64), state)
+        (expected,), expected_state = advance([link_points(meeting)], to_dtype(CONTACT_LAWS[stick_slip], torch.float64), state)
+        assert load.count is None and all(torch.equal(after[name], expected_state[name]) for name in PLANES)
         assert torch.equal(torch.stack(load.strength), torch.stack(expected.strength))
 
 

@@ -1,4 +1,4 @@
-"""Stick and slip: what the taxels' anchors remember, against the geometry and a closed form of Winkler's foundation."""
+"""Stick and slip: the memory of the taxels' anchors, against geometry and a closed form of Winkler's foundation."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 class Skin:
-    """Taxels on a link, and the same scene for `advance` and its reference, which must agree at every step."""
+    """Taxels on a link; each step runs `advance` and its reference, which must agree."""
 
     def __init__(self, pos, normal=UP, stick_slip=STICK_SLIP):
         self.pos = np.atleast_2d(np.asarray(pos, dtype=float))
@@ -25,7 +25,7 @@ class Skin:
         self.memory = {name: np.zeros(len(self.pos)) for name in PLANES}
 
     def step(self, *objects):
-        """Objects: (distances [m], translation [m] and rotation vector of the object in the link's frame)."""
+        """Advance by a step. Objects: (distances [m], translation [m] and rotation vector in the link's frame)."""
         num = len(self.pos)
         phi = np.stack([np.broadcast_to(distance, num) for distance, *_ in objects], axis=1).astype(float)
         turns = [Rotation.from_rotvec(turn).as_matrix() for _, _, turn in objects]
@@ -34,13 +34,13 @@ class Skin:
             np.stack([-turn.T @ at for turn, (_, at, _) in zip(turns, objects, strict=True)]), (num, len(objects), 3)
         )
         depth = np.maximum(0.0, (self.stick_slip.standoff - phi).max(axis=1))
-        none = np.zeros((num, 3))
-        touch = ReferencePenetration(depth, none, none, none, phi, np.zeros((*phi.shape, 3)), rotation, offset)
-        before = {name: torch.from_numpy(value)[None] for name, value in self.memory.items()}
+        zero = np.zeros((num, 3))
+        touch = ReferencePenetration(depth, zero, zero, zero, phi, np.zeros((*phi.shape, 3)), rotation, offset)
+        previous = {name: torch.from_numpy(value)[None] for name, value in self.memory.items()}
         expected, self.memory = advance_reference(touch, self.pos, self.normal, self.stick_slip, self.memory)
-        felt = self.felt(self.pos, phi, rotation, offset, depth)
-        found, after = advance(felt, self.planes(self.pos), self.planes(self.normal), self.stick_slip, before)
-        np.testing.assert_allclose(torch.stack(found, dim=-1)[0], expected, rtol=1e-12, atol=1e-16)
+        penetration = self.felt(self.pos, phi, rotation, offset, depth)
+        displacement, after = advance(penetration, self.planes(self.pos), self.planes(self.normal), self.stick_slip, previous)
+        np.testing.assert_allclose(torch.stack(displacement, dim=-1)[0], expected, rtol=1e-12, atol=1e-16)
         for name in PLANES:
             np.testing.assert_allclose(after[name][0], self.memory[name], rtol=1e-12, atol=1e-16)
         return expected
@@ -68,46 +68,48 @@ class Skin:
 HERE = ([0.0, 0, 0], [0.0, 0, 0])
 
 
-def test_a_translation_while_pressed_is_the_displacement():
-    """From anywhere: where the object was first felt does not matter. The part along the normal is left out."""
+def test_the_displacement_equals_a_translation_while_pressed():
+    """The place of first touch does not matter; the part along the normal is left out."""
     skin = Skin([[1e-3, 2e-3, 0], [0, 0, 0]])
     start = np.array([3e-3, -1e-3, 5e-3])
     turn = [0.3, 0.8, -0.2]
     assert not skin.step((-1e-3, start, turn)).any()
-    for way in ([4e-4, -2e-4, 1e-3], [-6e-4, 1e-4, -3e-4]):
-        found = skin.step((-1e-3, start + way, turn))
-        np.testing.assert_allclose(found, [[way[0], way[1], 0]] * 2, atol=1e-16)
+    for shift in ([4e-4, -2e-4, 1e-3], [-6e-4, 1e-4, -3e-4]):
+        displacement = skin.step((-1e-3, start + shift, turn))
+        np.testing.assert_allclose(displacement, [[shift[0], shift[1], 0]] * 2, atol=1e-16)
 
 
-def test_a_rotation_while_pressed_turns_every_place():
-    """About the normal through the origin: t = (R − 1) x; about a tangent, the tangential part of the same."""
+def test_a_rotation_while_pressed_displaces_every_taxel():
+    """About the normal through the origin: t = (R − 1) x; about a tangent, the tangential part of it."""
     x = np.array([[1e-3, 0.5e-3, 0.0], [-2e-3, 0, 0]])
     for turn in ([0, 0, 0.4], [0.2, 0, 0], [0.1, -0.2, 0.3]):
         skin = Skin(x)
         skin.step((-1e-3, *HERE))
-        found = skin.step((-1e-3, [0.0, 0, 0], turn))
+        displacement = skin.step((-1e-3, [0.0, 0, 0], turn))
         moved = x @ Rotation.from_rotvec(turn).as_matrix().T - x
-        np.testing.assert_allclose(found, moved * [1, 1, 0], atol=1e-16)
+        np.testing.assert_allclose(displacement, moved * [1, 1, 0], atol=1e-16)
 
 
 def test_each_taxel_has_its_own_tangent_plane():
     normal = np.array([[0, 0, 1.0], [1.0, 0, 0], [0.6, 0, 0.8]])
     skin = Skin(np.zeros((3, 3)), normal)
     skin.step((-1e-3, *HERE))
-    found = skin.step((-1e-3, [1e-3, 2e-3, 0], [0.0, 0, 0]))
-    np.testing.assert_allclose(found, [[1e-3, 2e-3, 0], [0, 2e-3, 0], [1e-3 * (1 - 0.36), 2e-3, -1e-3 * 0.48]], atol=1e-16)
+    displacement = skin.step((-1e-3, [1e-3, 2e-3, 0], [0.0, 0, 0]))
+    np.testing.assert_allclose(
+        displacement, [[1e-3, 2e-3, 0], [0, 2e-3, 0], [1e-3 * (1 - 0.36), 2e-3, -1e-3 * 0.48]], atol=1e-16
+    )
 
 
-def test_lifting_lets_go_and_touching_again_takes_hold_anew():
-    """Within the band between −enter and +exit nothing changes; beyond it the way so far is forgotten."""
-    skin, way = Skin([0, 0, 0]), [2e-4, 0.0, 0]
+def test_lifting_releases_and_touching_again_restarts():
+    """Between −enter and +exit nothing changes; beyond, the displacement is forgotten."""
+    skin, shift = Skin([0, 0, 0]), [2e-4, 0.0, 0]
     assert not skin.step((-0.5e-5, *HERE)).any() and skin.memory["object"][0] == 0  # not deep enough
     skin.step((-2e-5, *HERE))
     assert skin.memory["object"][0] == 1
-    np.testing.assert_allclose(skin.step((0.9e-4, way, [0.0, 0, 0]))[0], way, atol=1e-16)  # held on to
-    assert not skin.step((1.1e-4, way, [0.0, 0, 0])).any() and skin.memory["object"][0] == 0
+    np.testing.assert_allclose(skin.step((0.9e-4, shift, [0.0, 0, 0]))[0], shift, atol=1e-16)  # still held
+    assert not skin.step((1.1e-4, shift, [0.0, 0, 0])).any() and skin.memory["object"][0] == 0
     assert not any(skin.memory[name].any() for name in PLANES)
-    skin.step((-2e-5, way, [0.0, 0, 0]))
+    skin.step((-2e-5, shift, [0.0, 0, 0]))
     np.testing.assert_allclose(skin.step((-2e-5, [5e-4, 0, 0], [0.0, 0, 0]))[0], [3e-4, 0, 0], atol=1e-16)
     assert not skin.step((np.inf, [5e-4, 0, 0], [0.0, 0, 0])).any() and skin.memory["object"][0] == 0  # the gate closed
 
@@ -125,15 +127,15 @@ def test_a_standoff_raises_both_thresholds():
 
 
 def test_one_object_holds_at_a_time():
-    """The deepest when it was taken, the first among equals (to 1e-7 m); another takes over only once that one has left."""
+    """The deepest at first touch holds, or the first among equals (to 1e-7 m); another takes over only after its release."""
     skin = Skin([0, 0, 0])
     near, far = (-1e-3, *HERE), (-2e-3, *HERE)
     skin.step(near, far)
     assert skin.memory["object"][0] == 2
     skin.step((-5e-3, *HERE), near)
     assert skin.memory["object"][0] == 2
-    found = skin.step((-5e-3, [7e-4, 0, 0], [0.0, 0, 0]), (-1e-3, [0, 1e-4, 0], [0.0, 0, 0]))
-    np.testing.assert_allclose(found[0], [0, 1e-4, 0], atol=1e-16)
+    displacement = skin.step((-5e-3, [7e-4, 0, 0], [0.0, 0, 0]), (-1e-3, [0, 1e-4, 0], [0.0, 0, 0]))
+    np.testing.assert_allclose(displacement[0], [0, 1e-4, 0], atol=1e-16)
     skin.step((-5e-3, [7e-4, 0, 0], [0.0, 0, 0]), (1.0, [0, 1e-4, 0], [0.0, 0, 0]))
     assert skin.memory["object"][0] == 1
     np.testing.assert_allclose(skin.step((-5e-3, [9e-4, 0, 0], [0.0, 0, 0]), (1.0, *HERE))[0], [2e-4, 0, 0], atol=1e-16)
@@ -144,14 +146,14 @@ def test_one_object_holds_at_a_time():
 
 @pytest.mark.parametrize("way", [[3e-3, 4e-3, 0], [-1e-3, 0.0, 0]])
 def test_the_cap_holds_exactly_and_the_anchor_is_dragged(way):
-    """Beyond μ' h the displacement keeps its direction; moving back at once unloads from there, as a slider does."""
+    """Beyond μ' h the displacement keeps its direction; moving back unloads at once, like a slider."""
     slip, depth, turn = 0.5, 1e-3, [0.2, -0.1, 0.5]
     skin, way = Skin([1e-3, 0, 0], stick_slip=STICK_SLIP._replace(slip=slip)), np.array(way)
     skin.step((-depth, np.zeros(3), turn))
-    found = skin.step((-depth, way, turn))[0]
-    np.testing.assert_allclose(found, slip * depth * way / np.linalg.norm(way), rtol=1e-12, atol=1e-18)
-    back = -0.1 * found
-    np.testing.assert_allclose(skin.step((-depth, way + back, turn))[0], 0.9 * found, rtol=1e-12, atol=1e-17)
+    displacement = skin.step((-depth, way, turn))[0]
+    np.testing.assert_allclose(displacement, slip * depth * way / np.linalg.norm(way), rtol=1e-12, atol=1e-18)
+    back = -0.1 * displacement
+    np.testing.assert_allclose(skin.step((-depth, way + back, turn))[0], 0.9 * displacement, rtol=1e-12, atol=1e-17)
     held = skin.step((-depth / 2, way + back, turn))[0]  # with half the depth half is held
     assert np.linalg.norm(held) == pytest.approx(slip * depth / 2, rel=1e-12)
     assert not skin.step((0.5e-4, way + back, turn)).any()  # out of contact, not yet let go: nothing is held
@@ -166,7 +168,7 @@ def test_below_the_cap_nothing_slides():
     np.testing.assert_array_equal([skin.memory[name] for name in PLANES], anchor)
 
 
-def test_a_skin_of_springs_is_stiffest_against_mindlins_at_seven_sixteenths():
+def test_a_skin_of_springs_differs_most_from_mindlins_at_seven_sixteenths():
     fine = np.linspace(0, 1, 4001)
     difference = friction.loading(fine) - friction.mindlin(fine)
     assert difference.max() == pytest.approx(27 / 256, abs=1e-6)
@@ -175,7 +177,7 @@ def test_a_skin_of_springs_is_stiffest_against_mindlins_at_seven_sixteenths():
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_gradients_are_finite_at_every_corner(dtype):
-    """Nothing felt; just let go; no displacement at no depth; displacement at no depth; at the cap."""
+    """No contact; just released; no displacement at zero depth; displacement at zero depth; at the cap."""
     num = 5
     depth = torch.tensor([[0.0, 0.0, 0.0, 0.0, 1e-3]], dtype=dtype, requires_grad=True)
     phi = torch.tensor([[1.0, 2e-4, 0.5e-4, 0.5e-4, -1e-3]], dtype=dtype, requires_grad=True)
@@ -184,23 +186,23 @@ def test_gradients_are_finite_at_every_corner(dtype):
     frame = Frame((one, zero, zero, zero, one, zero, zero, zero, one), (-along, zero, zero))
     state = dict.fromkeys(PLANES[:3], zero) | {"object": torch.tensor([[0.0, 1, 1, 1, 1]], dtype=dtype)}
     flat = (zero[0], zero[0], zero[0])
-    felt = Penetration(flat, depth, None, None, None, {"o": Distance(phi, (zero, zero, zero))}, {"o": frame})
+    penetration = Penetration(flat, depth, None, None, None, {"o": Distance(phi, (zero, zero, zero))}, {"o": frame})
     slip = torch.tensor(0.5, dtype=dtype, requires_grad=True)
-    found, after = advance(felt, flat, (zero[0], zero[0], one[0]), STICK_SLIP._replace(slip=slip), state)
-    total = sum(part.sum() for part in (*found, *after.values()))
+    displacement, after = advance(penetration, flat, (zero[0], zero[0], one[0]), STICK_SLIP._replace(slip=slip), state)
+    total = sum(part.sum() for part in (*displacement, *after.values()))
     for gradient in torch.autograd.grad(total, [depth, phi, along, slip], allow_unused=True):
         assert gradient is None or torch.isfinite(gradient).all()
 
 
-def test_not_a_number_comes_out_and_is_not_remembered():
+def test_nan_is_returned_and_not_remembered():
     """A broken pose reads NaN at held taxels, takes no anchor, and leaves the old ones."""
     skin = Skin(np.zeros((2, 3)))
     skin.step((np.array([-1e-3, 1.0]), *HERE))
-    before = {name: torch.from_numpy(value.copy())[None] for name, value in skin.memory.items()}
+    previous = {name: torch.from_numpy(value.copy())[None] for name, value in skin.memory.items()}
     nan = np.full((2, 1, 3, 3), np.nan)
-    felt = Skin.felt(skin.pos, nan[:, :, 0, 0], nan, nan[:, :, 0], nan[:, 0, 0, 0])
+    penetration = Skin.felt(skin.pos, nan[:, :, 0, 0], nan, nan[:, :, 0], nan[:, 0, 0, 0])
     stick_slip = STICK_SLIP._replace(slip=0.5)
-    found, after = advance(felt, Skin.planes(skin.pos), Skin.planes(np.array(skin.normal)), stick_slip, before)
-    assert found[0][0, 0].isnan()
+    displacement, after = advance(penetration, Skin.planes(skin.pos), Skin.planes(np.array(skin.normal)), stick_slip, previous)
+    assert displacement[0][0, 0].isnan()
     for name in PLANES:
-        torch.testing.assert_close(after[name], before[name], rtol=0, atol=0)
+        torch.testing.assert_close(after[name], previous[name], rtol=0, atol=0)

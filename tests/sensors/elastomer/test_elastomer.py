@@ -1,4 +1,4 @@
-"""The kind as a whole: the conformance suite, cases by hand, gradients, and what is refused."""
+"""The kind as a whole: the conformance suite, cases by hand, gradients, and refused fields."""
 
 import numpy as np
 import pytest
@@ -22,14 +22,14 @@ class TestElastomer(KindConformance):
 class TestElastomerWithoutAStandoff(KindConformance):
     kind = ELASTOMER
     parameters = {"friction": 0.6}
-    test_compiled_equals_eager = None  # its graph is that of the one above, and a gate's of other kinds
+    test_compiled_equals_eager = None  # its graph equals the one above; other kinds cover the gate
 
 
 class TestElastomerAsInThePaper(KindConformance):
     kind = ELASTOMER
     parameters = {"standoff": 0.003, "model": "paper", "normalize": "peak", "compressibility": 0.4, "anchors": "taxels"}
     gates = ("geometric",)
-    test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
+    test_compiled_equals_eager = None  # its graph is part of another kind's
 
 
 class TestHalfSpace(KindConformance):
@@ -52,17 +52,17 @@ class Unsheared(KindConformance):
 
 @pytest.mark.parametrize(("suite", "tolerance"), [(BondedLayer(), 1e-5), (Unsheared(), 1e-12)])
 def test_other_kernels_equal_their_reference(tmp_path, suite, tolerance):
-    """The layer's table against the integrals themselves; pressure without shear, which keeps no state."""
+    """The layer's table against the integrals, and pressure without shear, which keeps no state."""
     scene = tmp_path / "scene.xml"
     scene.write_text(SCENE)
     touch, reference = suite.build(suite.document(scene), torch.float64)
     assert touch.has_state == isinstance(suite, BondedLayer)
-    for found in suite.states(touch):
-        assert_agrees(touch(found)["s"], reference, found, tolerance)
+    for inputs in suite.states(touch):
+        assert_agrees(touch(inputs)["s"], reference, inputs, tolerance)
 
 
-def test_shear_is_in_what_the_suite_compares(tmp_path):
-    """In the suite's states anchors are held from one to the next, and they move markers."""
+def test_shear_matters_in_the_suites_states(tmp_path):
+    """In the suite's states anchors persist from one to the next, and they move markers."""
     suite = TestElastomer()
     scene = tmp_path / "scene.xml"
     scene.write_text(SCENE)
@@ -73,29 +73,29 @@ def test_shear_is_in_what_the_suite_compares(tmp_path):
 
 
 def test_the_paper_as_printed_moves_markers_farther():
-    found = markers.dilation()
-    assert found.paper_error > 10 * abs(found.exact[3])
+    comparison = markers.dilation()
+    assert comparison.paper_error > 10 * abs(comparison.exact[3])
 
 
-def test_shear_begins_with_the_motion_and_a_load_draws_markers_near():
+def test_shear_starts_with_the_motion_and_a_load_draws_markers_near():
     assert pressed()[0, 0] == 0
     elastic = markers.elastic_skin().ours
     assert elastic[2] < 0 and pressed(**ELASTIC)[1, 0] < 0
 
 
-def test_a_standoff_is_felt_above_the_taxels():
+def test_a_standoff_acts_above_the_taxels():
     u = pressed(depth=-1e-3, standoff="1.5 mm", shear_strength=0)
     np.testing.assert_allclose(u[0, 2], markers.WEIGHT * 100 * 5e-4**1.2, rtol=1e-12)
 
 
 @pytest.mark.parametrize("gate", [None, "geometric"])
-def test_a_standoff_is_felt_before_the_simulator_has_a_contact(tmp_path, gate):
-    """A ball that comes down: the skin's bulge follows its depth from the first touch on, whatever the simulator finds."""
+def test_a_standoff_acts_before_the_simulator_has_a_contact(tmp_path, gate):
+    """A descending ball: the bulge follows its depth from first touch, whatever contacts the simulator has."""
     touch = module(tmp_path, PROBES[:1], BALL, kind="elastomer", gate=gate, standoff="1.5 mm", shear_strength=0)
     assert touch.inputs.fields == ("body_pos", "body_quat")
 
 
-def test_without_a_standoff_the_gate_stays_the_pairs(tmp_path):
+def test_without_a_standoff_the_gate_is_still_the_pairs(tmp_path):
     touch = module(tmp_path, PROBES, BALL, kind="elastomer", gate=None)
     assert "contact_found" in touch.inputs.fields
 
@@ -109,8 +109,8 @@ def test_lifting_ends_the_shear(tmp_path):
     torch.testing.assert_close(lifted, fresh(state(fresh, pos=[2e-4, 0, 0.0095]))["s"], rtol=0, atol=0)
 
 
-def test_an_elastic_skin_is_not_pulled_where_nothing_presses(tmp_path):
-    """Within the band in which anchors are kept, out of contact: no traction at all; in contact again, the old anchor."""
+def test_an_elastic_skin_has_no_traction_without_pressure(tmp_path):
+    """Out of contact, within the band that keeps anchors, there is no traction; back in contact, the old anchor acts."""
     touch = module(tmp_path, PROBES, BALL, kind="elastomer", **ELASTIC)
     before, above, after = (touch(state(touch, pos=[x, 0, z]))["s"] for x, z in ((0, 0.0095), (2e-4, 0.01005), (2e-4, 0.0095)))
     assert not above.any()
@@ -132,8 +132,8 @@ def read_once(scene, touch, memory):
 
 
 @pytest.mark.parametrize("sensor", [{}, {"friction": 0.3}, ELASTIC, {**ELASTIC, "friction": 0.3}])
-def test_gradients_by_pose_with_anchors_held(tmp_path, sensor):
-    """Of the second call, while taxels stick, or some of them slide: against central differences."""
+def test_gradients_by_pose_with_held_anchors(tmp_path, sensor):
+    """Gradients of the second call, while taxels stick or some slide, against central differences."""
     touch = module(tmp_path, GRID, BALL, kind="elastomer", **sensor)
     first, second = state(touch, pos=[0, 0, 0.0085]), state(touch, pos=[3e-4, 1e-4, 0.0084], quat=[1, 0.02, 0.01, 0.03])
     touch(first)
@@ -160,7 +160,7 @@ def test_gradients_by_pose_with_anchors_held(tmp_path, sensor):
     ],
 )
 def test_gradients_by_parameter(tmp_path, field, constant, value, sensor):
-    """Derivatives by the constants are those by the document's field, by central differences of documents."""
+    """Derivatives by the constants equal those by the document's field, from central differences of documents."""
     sensor = {**sensor, field: value}
 
     def read(touch):
@@ -173,24 +173,24 @@ def test_gradients_by_parameter(tmp_path, field, constant, value, sensor):
     touch = module(tmp_path, GRID, BALL, kind="elastomer", **sensor)
     factor = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
     for name in [constant] if isinstance(constant, str) else constant:
-        own = f"sensors/s/{name}"
-        ratio = float(touch.plan.arrays[own]) / value
-        touch.constants._buffers[own] = ratio * value * factor
+        key = f"sensors/s/{name}"
+        ratio = float(touch.plan.arrays[key]) / value
+        touch.constants._buffers[key] = ratio * value * factor
     direction = torch.randn(expected.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    (found,) = torch.autograd.grad((read(touch) * direction).sum(), [factor])
-    assert float(found) / value == pytest.approx(float((expected * direction).sum()), rel=1e-6)
+    (derivative,) = torch.autograd.grad((read(touch) * direction).sum(), [factor])
+    assert float(derivative) / value == pytest.approx(float((expected * direction).sum()), rel=1e-6)
 
 
 @pytest.mark.parametrize("exponent", [0.7, 1.0, 1.2])
 @pytest.mark.parametrize("height", [0.0, 1e-9, 1e-4, 5.0])
 def test_gradients_are_finite_at_first_touch(tmp_path, exponent, height):
-    """At no depth at all, just above, and far away: no NaN, for α below one either."""
+    """At zero depth, just above, and far away: no NaN, for α < 1 too."""
     touch = module(tmp_path, PROBES, BALL, kind="elastomer", depth_exponent=exponent, friction=0.5, dtype=torch.float32)
     for down in (0.0, 1e-7):
-        given = state(touch, pos=[0, 0, 0.01 + height - down])
-        assert given.body_pos is not None
-        given.body_pos.requires_grad_()
-        (gradient,) = torch.autograd.grad(touch(given)["s"].sum(), [given.body_pos])
+        inputs = state(touch, pos=[0, 0, 0.01 + height - down])
+        assert inputs.body_pos is not None
+        inputs.body_pos.requires_grad_()
+        (gradient,) = torch.autograd.grad(touch(inputs)["s"].sum(), [inputs.body_pos])
         assert torch.isfinite(gradient).all()
 
 
@@ -220,18 +220,18 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("fields", "message"), REFUSED)
-def test_what_would_be_ignored_or_is_missing_is_refused(tmp_path, fields, message):
+def test_unused_and_missing_fields_are_refused(tmp_path, fields, message):
     with pytest.raises(SpecError) as caught:
         module(tmp_path, PROBES, BALL, kind="elastomer", **fields)
     assert message in str(caught.value) and "sensors.s" in str(caught.value)
 
 
-def test_half_is_a_poissons_ratio_like_any_other(tmp_path):
+def test_one_half_is_an_ordinary_poissons_ratio(tmp_path):
     """ν → 1/2 is smooth, for the half-space and the layer."""
     for fields in ({}, {"kernel": "bonded_layer", "thickness": 3e-3}):
         near, at = (pressed((1e-4, 0), **{**ELASTIC, **fields, "poissons_ratio": nu}) for nu in (0.5 - 1e-6, 0.5))
         np.testing.assert_allclose(near, at, rtol=0, atol=1e-4 * np.abs(at).max())
 
 
-def test_a_plan_knows_its_kind():
+def test_the_elastomer_is_a_known_kind():
     assert ELASTOMER in tgdsl.sensors.KINDS and ELASTOMER.name == "elastomer"

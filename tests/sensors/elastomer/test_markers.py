@@ -1,4 +1,4 @@
-"""Markers at places that are not the taxels: the operators are rectangular, taxels press and markers are read."""
+"""Markers away from the taxels: the operators are rectangular, taxels press and markers are read."""
 
 import numpy as np
 import pytest
@@ -36,15 +36,15 @@ def points(places):
 def compiled(folder, sensor, markers=None, taxels=None):
     (folder / "scene.xml").write_text(SCENE)
     resolutions = {"taxels": taxels or {"pad": GRID}, **({} if markers is None else {"dots": markers})}
-    own = {"kind": "elastomer", "links": "pad", "feels": ["ball"], "gate": "geometric", **sensor}
-    own |= {} if markers is None else {"markers": "dots"}
+    fields = {"kind": "elastomer", "links": "pad", "feels": ["ball"], "gate": "geometric", **sensor}
+    fields |= {} if markers is None else {"markers": "dots"}
     return tgdsl.compile(
         {
             "tgdsl": 1,
             "robot": {"model": str(folder / "scene.xml"), "layout": {"resolutions": resolutions}},
             "resolution": "taxels",
             "objects": {"ball": {"body": "ball"}},
-            "sensors": {"skin": own},
+            "sensors": {"skin": fields},
         },
         dtype="float64",
     )
@@ -57,29 +57,29 @@ def state(touch, x=0.0):
     return tgdsl.SceneState(body_pos=pos, body_quat=quat)
 
 
-def dragged(touch):
-    """Return what is read after the ball was pressed in and dragged by 0.1 mm."""
+def dragged_readings(touch):
+    """Return the readings after pressing the ball in and dragging it by 0.1 mm."""
     touch(state(touch))
     return touch(state(touch, 1e-4))["skin"][0].numpy()
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_markers_at_the_taxels_places_read_what_taxels_read(tmp_path, kernel):
-    """In the reverse order; with the same sources the reading is the same."""
+def test_markers_at_the_taxels_read_like_the_taxels(tmp_path, kernel):
+    """In reverse order; equal sources give equal readings."""
     plain = compiled(tmp_path, KERNELS[kernel])
     places = plain.taxels["skin"]["pos"]
     with_markers = compiled(tmp_path, KERNELS[kernel], points(places[::-1]))
-    expected = dragged(plain)
+    expected = dragged_readings(plain)
     assert abs(expected).max() > 0
-    assert dragged(with_markers)[::-1] == pytest.approx(expected, rel=1e-9, abs=1e-9 * abs(expected).max())
+    assert dragged_readings(with_markers)[::-1] == pytest.approx(expected, rel=1e-9, abs=1e-9 * abs(expected).max())
 
 
 @pytest.mark.parametrize("kernel", ["half_space", "bonded_layer"])
 def test_markers_elsewhere_read_the_sum_of_exact_profiles(tmp_path, kernel):
-    """Σ_i G(r_ij) [τ_i, p_i] A_i with each profile at its own distance: the layer's table errs by some 1e-6."""
+    """Σ_i G(r_ij) [τ_i, p_i] A_i with each profile at its own distance: the layer's table errs by about 1e-6."""
     places = np.array([[0.37e-3, -0.81e-3, 0], [6.2e-3, 1.4e-3, 0], [-11e-3, 9e-3, 0]])
     touch = compiled(tmp_path, KERNELS[kernel], points(places))
-    found, taxels = dragged(touch), touch.plan.layout
+    readings, taxels = dragged_readings(touch), touch.plan.layout
     spec_layer = Layer(4e-3 if kernel == "bonded_layer" else np.inf, 0.0, YOUNG / (2 * (1 + NU)), NU)
     depth = np.maximum(0.0, BALL - np.linalg.norm(taxels.pos - np.array([1e-4, 0, BALL - DEPTH]), axis=1))
     ratio = YOUNG / (2 * (1 + NU) * 4e-3 * STIFFNESS) if kernel == "bonded_layer" else 2 * (1 - NU) / (2 - NU)
@@ -96,18 +96,18 @@ def test_markers_elsewhere_read_the_sum_of_exact_profiles(tmp_path, kernel):
         expected[j, :2] = ((along * taxels.area)[:, None] * e).sum(axis=0)
         expected[j, 0] += ((g.along - g.bend) * traction * taxels.area).sum()
         expected[j, 2] = -(into * taxels.area).sum()
-    assert found == pytest.approx(expected, abs=1e-5 * abs(expected).max())
+    assert readings == pytest.approx(expected, abs=1e-5 * abs(expected).max())
 
 
-def test_what_is_read_is_of_markers(tmp_path):
-    """Rows, their places and noise are the markers'; gains are then of the reading."""
+def test_readings_have_the_markers_rows(tmp_path):
+    """Rows, places and noise are the markers'; gains apply to the reading."""
     places = points([[1e-3, 0, 0], [2e-3, 5e-3, 0]])
     touch, clean = (
         compiled(tmp_path, {**KERNELS["gaussian"], **noise}, places) for noise in ({"noise": {"gain": [0.5, 0.5]}}, {})
     )
     assert touch.outputs[0].rows == "marker" and touch.outputs[0].shape == (2, 3)
     assert touch.rows["skin"]["pos"][1].tolist() == [2e-3, 5e-3, 0]
-    assert dragged(touch) == pytest.approx(0.5 * dragged(clean), rel=1e-12)
+    assert dragged_readings(touch) == pytest.approx(0.5 * dragged_readings(clean), rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -118,9 +118,9 @@ def test_what_is_read_is_of_markers(tmp_path):
         ({"boundary": {}, "thickness": 2e-3}, points([[0, 0, 0]]), "a clamped `boundary` is of markers that are the taxels"),
     ],
 )
-def test_markers_that_cannot_be(tmp_path, sensor, markers, message):
+def test_impossible_markers_are_mistakes(tmp_path, sensor, markers, message):
     (tmp_path / "scene.xml").write_text(SCENE)
-    own = {"kind": "elastomer", "links": "pad", "feels": ["ball"], "markers": "dots", **sensor}
+    fields = {"kind": "elastomer", "links": "pad", "feels": ["ball"], "markers": "dots", **sensor}
     resolutions = {"taxels": {"pad": GRID}, "dots": markers}
     robot = {"model": str(tmp_path / "scene.xml"), "layout": {"resolutions": resolutions}}
     with pytest.raises(SpecError, match=message):
@@ -130,11 +130,11 @@ def test_markers_that_cannot_be(tmp_path, sensor, markers, message):
                 "robot": robot,
                 "resolution": "taxels",
                 "objects": {"ball": {"body": "ball"}},
-                "sensors": {"skin": own},
+                "sensors": {"skin": fields},
             }
         )
 
 
-def test_markers_on_other_links_are_missing(tmp_path):
+def test_markers_only_on_other_links_are_a_mistake(tmp_path):
     with pytest.raises(SpecError, match='the resolution "dots" has no taxels on pad'):
         compiled(tmp_path, KERNELS["gaussian"], {"ball": {"method": "points", "points": points([[0, 0, 0]])["pad"]["points"]}})

@@ -1,4 +1,4 @@
-"""The same operator as a matrix, a truncation and a convolution; where each may be used; and the clamped edge in it."""
+"""One operator as a matrix, a truncation and a convolution; where each may be used; and its clamped edge."""
 
 import numpy as np
 import pytest
@@ -44,8 +44,8 @@ def regular(rows, columns, pitch=(1.5e-3, 2e-3), shuffle=None):
 
 def applied(response, planes, part, form, tolerance=None, seed=0, dtype=torch.float64):
     folded = fold(response, planes, part, OperatorForm(form, tolerance))
-    given = [torch.from_numpy(np.random.default_rng(seed + i).normal(size=(5, len(part.pos)))) for i in range(planes[1])]
-    return torch.stack(apply([bound(folded)], given)), folded
+    values = [torch.from_numpy(np.random.default_rng(seed + i).normal(size=(5, len(part.pos)))) for i in range(planes[1])]
+    return torch.stack(apply([bound(folded)], values)), folded
 
 
 def bound(operator):
@@ -55,8 +55,8 @@ def bound(operator):
 
 @pytest.mark.parametrize("shape", [(9, 12), (7, 1), (1, 1), (4, 5)])
 @pytest.mark.parametrize("fields", [{"compressibility": 0.3}, {**ELASTIC, "friction": 0.5}, {**ELASTIC, "shear_strength": 0}])
-def test_the_convolution_is_the_matrix(shape, fields):
-    """To 1e-12 of the largest value, for every operator of both kernels, on a tilted grid whose taxels come in any order."""
+def test_the_convolution_equals_the_matrix(shape, fields):
+    """To 1e-12 of the largest value, for every operator of both kernels, on a tilted grid with taxels in any order."""
     part = regular(*shape, shuffle=1)
     for name, response in responses(spec(**fields), part, None).items():
         dense, _ = applied(response, PLANES[name], part, "dense")
@@ -91,47 +91,47 @@ def test_a_truncation_reads_within_its_tolerance():
 
 
 def test_links_do_not_couple():
-    """Two links: each plane is the two links' own, one after the other."""
+    """Two links: each plane holds the two links' values, one after the other."""
     first, second = regular(3, 4), regular(5, 2)
     links = [
         bound(fold(responses(spec(), part, None)["spread"], (3, 1), part, OperatorForm(form, 1e-9)))
         for part, form in ((first, "fft"), (second, "svd"))
     ]
-    given = torch.zeros(2, 22, dtype=torch.float64)
-    given[0, 3], given[1, 15] = 1.0, 1.0
-    found = torch.stack(apply(links, [given]))
-    assert not found[:, 0, 12:].any() and found[:, 0, :12].abs().max() > 0
-    assert found[:, 1, :12].abs().max() == 0 and found[:, 1, 12:].abs().max() > 0
+    values = torch.zeros(2, 22, dtype=torch.float64)
+    values[0, 3], values[1, 15] = 1.0, 1.0
+    results = torch.stack(apply(links, [values]))
+    assert not results[:, 0, 12:].any() and results[:, 0, :12].abs().max() > 0
+    assert results[:, 1, :12].abs().max() == 0 and results[:, 1, 12:].abs().max() > 0
 
 
 def test_the_choice_follows_the_table(monkeypatch):
-    """Dense unless another is cheaper by the table; a truncation, which is not exact, only where a tolerance is given."""
+    """Dense unless another form is cheaper by the table; a truncation, which is inexact, only with a tolerance."""
     part = regular(9, 12)
     response = responses(spec(), part, None)["drag"]
 
-    def chosen(tolerance=None, form="auto", taxels=part):
+    def chosen_form(tolerance=None, form="auto", taxels=part):
         return type(fold(response, (1, 1), taxels, OperatorForm(form, tolerance)))
 
-    assert chosen() is Dense
-    assert chosen(1e-2) is Truncated
-    assert chosen(1e-15) is Dense  # the whole rank costs more than the matrix
+    assert chosen_form() is Dense
+    assert chosen_form(1e-2) is Truncated
+    assert chosen_form(1e-15) is Dense  # the whole rank costs more than the matrix
     monkeypatch.setitem(COST, "fft", 1e-3)
-    assert chosen() is chosen(1e-2) is Convolution
+    assert chosen_form() is chosen_form(1e-2) is Convolution
     monkeypatch.setitem(COST, "dense", 1e-6)
-    assert chosen() is Dense
+    assert chosen_form() is Dense
 
 
 def test_a_large_grid_is_convolved_without_its_matrix():
-    """100 × 100 taxels: the matrix would have 10⁸ entries; only four columns of it are ever formed."""
+    """100 × 100 taxels: the matrix would have 10⁸ entries; only four of its columns are ever formed."""
     part = regular(100, 100)
     response = responses(spec(), part, None)["bulge"]
     sizes = []
 
-    def watched(source):
+    def recording_response(source):
         sizes.append(len(source))
         return response(source)
 
-    folded = fold(watched, (1, 1), part, OperatorForm("auto", None))
+    folded = fold(recording_response, (1, 1), part, OperatorForm("auto", None))
     assert isinstance(folded, Convolution) and sum(sizes) == 4
 
 
@@ -145,7 +145,7 @@ IRREGULAR = {
 
 
 @pytest.mark.parametrize("what", IRREGULAR)
-def test_a_convolution_elsewhere_is_refused_by_name(what):
+def test_a_convolution_on_an_irregular_grid_is_refused_by_name(what):
     part = IRREGULAR[what](regular(3, 4))
     assert what in str(grid(part))
     with pytest.raises(LowerError, match=what) as caught:
@@ -180,20 +180,20 @@ def document(folder, **sensor):
 
 def readings(folder, **sensor):
     module = tgdsl.compile(document(folder, **sensor), dtype=torch.float64)
-    found = []
+    outputs = []
     for at in ([0.001, 0.002, 0.0142], [0.0015, 0.0018, 0.0143]):
         pos = {"pad": [0.0, 0, 0], "item": at}
         state = SceneState(
             body_pos=torch.tensor([[pos[body] for body in module.inputs.bodies]], dtype=torch.float64),
             body_quat=torch.tensor([[[1.0, 0, 0, 0]] * 2], dtype=torch.float64),
         )
-        found.append(module(state)["s"])
-    return torch.stack(found), module
+        outputs.append(module(state)["s"])
+    return torch.stack(outputs), module
 
 
 @pytest.mark.parametrize("fields", [{}, {**ELASTIC, "friction": 0.4}])
-def test_a_module_reads_the_same_by_every_form(tmp_path, fields):
-    """A sphere pressed into a grid that was projected on a box, and dragged: all three forms, through the Plan."""
+def test_all_forms_give_the_same_readings(tmp_path, fields):
+    """A sphere pressed into a grid projected on a box, then dragged: all three forms, through the plan."""
     dense, _ = readings(tmp_path, operator="dense", **fields)
     fft, module = readings(tmp_path, operator="fft", **fields)
     svd, _ = readings(tmp_path, operator="svd", tolerance=1e-9, **fields)
@@ -203,7 +203,7 @@ def test_a_module_reads_the_same_by_every_form(tmp_path, fields):
     torch.testing.assert_close(svd, dense, rtol=0, atol=1e-7 * largest)
 
 
-def test_a_convolution_on_a_curved_link_is_a_located_mistake(tmp_path):
+def test_a_convolution_on_a_curved_link_is_a_mistake(tmp_path):
     source = document(tmp_path, operator="fft")
     (tmp_path / "scene.xml").write_text(SCENE.replace('type="box" size=".012 .01 .005"', 'type="sphere" size=".02"'))
     with pytest.raises(SpecError, match=r"sensors\.s\.operator.*regular planar grid"):
@@ -216,7 +216,7 @@ def rectangle(x, y):
 
 
 def pad_of(num, side, inset):
-    """Num × num taxels on a flat pad, the outermost `inset` [m] from its edge."""
+    """Return num × num taxels on a flat pad, the outermost `inset` [m] from its edge."""
     line = np.linspace(inset - side / 2, side / 2 - inset, num)
     pos = np.stack([*np.meshgrid(line, line, indexing="ij"), np.zeros((num, num))], axis=-1).reshape(-1, 3)
     return LinkTaxels(
@@ -224,8 +224,8 @@ def pad_of(num, side, inset):
     )
 
 
-def test_a_clamped_edge_does_not_move_and_the_middle_hardly_notices():
-    """Taxels 20 µm from the wall move by 20 µm/(t/√β) of the free field's normal slope or so; the middle is 10 t/√β away."""
+def test_a_clamped_edge_is_fixed_and_the_middle_hardly_changes():
+    """Taxels 20 µm from the wall move by about 20 µm/(t/√β) of the free field's normal slope; the middle is 10 t/√β away."""
     fields = {"thickness": 1.5e-3, "boundary": {}}
     part = pad_of(7, 0.018, 2e-5)
     clamped, free = (
@@ -248,10 +248,10 @@ def test_a_clamped_edge_does_not_move_and_the_middle_hardly_notices():
         np.testing.assert_array_equal(clamped[name](every), free[name](every))
 
 
-def test_clamping_is_linear_and_by_the_edges_own_displacement():
-    """A long pad far from its ends is a strip: u = u_free(edge)-driven sinh profile across it, for one line of sources.
+def test_clamping_is_linear_and_driven_by_the_edges_displacement():
+    """Far from its ends a long pad is a strip: the free displacement of its edge drives a sinh profile across it.
 
-    Sources along the middle line, alike along y, so that the field depends on x alone and points along it at the edges x = ±w:
+    Sources on the middle line are equal along y, so the field depends only on x and points along it at the edges x = ±w:
     u_corr(x) = −u_free(w) sinh(κx)/sinh(κw), κ = √(β/(1 + K))/t.
     """
     thickness, drag, bulk, half = 2e-3, 3.0, 0.5, 3e-3
@@ -261,10 +261,10 @@ def test_clamping_is_linear_and_by_the_edges_own_displacement():
     pos = np.concatenate([row, column])
     num = len(pos)
     part = LinkTaxels(pos, np.tile([0.0, 0, 1], (num, 1)), np.full(num, 1e-6), np.full((num, 2), -1), np.ones(num, dtype=bool))
-    made = spec(thickness=thickness, dilation_falloff=80000, boundary={"drag": drag, "bulk": bulk})
-    added = clamping(made, part, rectangle(2 * half, 0.024))[:, 0, :9, 9:].sum(axis=2)
+    elastomer = spec(thickness=thickness, dilation_falloff=80000, boundary={"drag": drag, "bulk": bulk})
+    added = clamping(elastomer, part, rectangle(2 * half, 0.024))[:, 0, :9, 9:].sum(axis=2)
     edge = np.array([[half, 0.0, 0]])
-    free = gaussian(made, part).spread(edge, np.array([[0.0, 0, 1]]), column)[0, 0, 0].sum()
+    free = gaussian(elastomer, part).spread(edge, np.array([[0.0, 0, 1]]), column)[0, 0, 0].sum()
     kappa = np.sqrt(drag / (1 + bulk)) / thickness
     expected = -free * np.sinh(kappa * x) / np.sinh(kappa * half)
     np.testing.assert_allclose(added[0], expected, atol=0.01 * abs(free))
@@ -272,14 +272,14 @@ def test_clamping_is_linear_and_by_the_edges_own_displacement():
 
 
 def test_a_clamped_pad_is_never_convolved():
-    """Not even if asked for a tolerance: near its edge a response is not that of the middle."""
+    """Near its edge a response differs from the middle's, whatever the tolerance."""
     part = regular(5, 5, pitch=(2e-3, 2e-3))
     folded = fold(responses(spec(), part, None)["spread"], (3, 1), part, OperatorForm("auto", None), is_alike=False)
     assert isinstance(folded, Dense)
 
 
-def test_a_boundary_through_the_plan(tmp_path):
-    """The pad is a region of the link: its upper face; by default all of it, a closed box, which has no edge."""
+def test_a_boundary_changes_readings_in_the_plane(tmp_path):
+    """The pad is a region of the link, here its upper face; by default it is the whole closed box, which has no edge."""
     face = {"pad": {"facing": [0, 0, 1], "within": "10 deg"}}
     clamped, _ = readings(tmp_path, thickness=2e-3, shear_strength=0, boundary=face)
     free, _ = readings(tmp_path, thickness=2e-3, shear_strength=0)

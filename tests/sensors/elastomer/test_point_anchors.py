@@ -15,7 +15,7 @@ from tgdsl.testing import SCENE, KindConformance
 
 
 class Creeping(KindConformance):
-    """Poses that move little from one state to the next, so that points stay in the skin; one gate in three closes at last."""
+    """Poses move little between states, so that points stay in the skin; one gate in three closes at the end."""
 
     kind = ELASTOMER
     step = 5e-4
@@ -24,14 +24,14 @@ class Creeping(KindConformance):
         first = module.example_state(num_envs or self.num_envs, seed=0)
         assert first.body_pos is not None and first.body_quat is not None
         for step in range(self.num_steps):
-            way = torch.randn(first.body_pos.shape, generator=torch.Generator().manual_seed(step), dtype=torch.float64)
-            turned = first.body_quat + 5 * self.step * step * torch.cat([way, way[..., :1]], dim=-1)
-            found = first.contact_found
-            if found is not None:
-                found = torch.ones_like(found)
-                found[::3, 0] = float(step < 2)
-            pos = first.body_pos + self.step * step * way
-            yield dataclasses.replace(first, body_pos=pos, body_quat=turned, contact_found=found)
+            direction = torch.randn(first.body_pos.shape, generator=torch.Generator().manual_seed(step), dtype=torch.float64)
+            turned = first.body_quat + 5 * self.step * step * torch.cat([direction, direction[..., :1]], dim=-1)
+            is_in_contact = first.contact_found
+            if is_in_contact is not None:
+                is_in_contact = torch.ones_like(is_in_contact)
+                is_in_contact[::3, 0] = float(step < 2)
+            pos = first.body_pos + self.step * step * direction
+            yield dataclasses.replace(first, body_pos=pos, body_quat=turned, contact_found=is_in_contact)
 
 
 class TestElastomerOnPoints(Creeping):
@@ -40,22 +40,22 @@ class TestElastomerOnPoints(Creeping):
 
 
 class TestElastomerOnPointsAsInThePaper(Creeping):
-    test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
-    test_gradients_of_parameters_equal_finite_differences = None  # those of points above, and of the paper's model of taxels
+    test_compiled_equals_eager = None  # its graph is part of another kind's
+    test_gradients_of_parameters_equal_finite_differences = None  # as for points above, and for the paper's model of taxels
     parameters = {"feels": ["item", "tool"], "points": 80, "model": "paper", "shear_strength": 200}
 
 
-def test_shear_is_in_what_the_suite_compares(tmp_path):
-    """In the suite's states points are held from one to the next, some of them slide, and they move markers."""
+def test_shear_matters_in_the_suites_states(tmp_path):
+    """In the suite's states points stay held, some of them slide, and they move markers."""
     suite, free = TestElastomerOnPoints(), TestElastomerOnPointsAsInThePaper()
     scene = tmp_path / "scene.xml"
     scene.write_text(SCENE)
-    for one, other in ((suite, {"friction": 0}), (suite, {"friction": 5}), (free, {"shear_falloff": 4000})):
-        touch, _ = one.build(one.document(scene), torch.float64)
-        changed, _ = one.build(one.document(scene, **other), torch.float64)
+    for case, changes in ((suite, {"friction": 0}), (suite, {"friction": 5}), (free, {"shear_falloff": 4000})):
+        touch, _ = case.build(case.document(scene), torch.float64)
+        changed, _ = case.build(case.document(scene, **changes), torch.float64)
         differences = []
-        for found in one.states(touch):
-            read, reread = touch(found)["s"], changed(found)["s"]
+        for inputs in case.states(touch):
+            read, reread = touch(inputs)["s"], changed(inputs)["s"]
             differences.append(float((read - reread).abs().max() / read.abs().max()))
         assert differences[0] == 0 and max(differences) > 5e-3
 
@@ -66,7 +66,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 class Skin:
-    """Markers at the origin and beside it, two points, and the same steps for torch and the reference, which must agree."""
+    """Markers at the origin and next to it, and two points; each step runs torch and the reference, which must agree."""
 
     POS = np.array([[0.0, 0, 0], [4e-3, 3e-3, 0]])
     NORMAL = np.array([UP, [0.6, 0, 0.8]])
@@ -78,21 +78,21 @@ class Skin:
     def step(self, pos, distance):
         pos = np.asarray(pos, dtype=float)
         distance = np.broadcast_to(np.asarray(distance, dtype=float), (2,))
-        by_hand = ReferencePoints(np.arange(2), pos, distance, self.gradient, 3e-6)
-        expected, after = reference_drag([by_hand], self.POS, self.NORMAL, self.stick_slip, 2000.0, 6e-6, self.memory)
+        reference_points = ReferencePoints(np.arange(2), pos, distance, self.gradient, 3e-6)
+        expected, after = reference_drag([reference_points], self.POS, self.NORMAL, self.stick_slip, 2000.0, 6e-6, self.memory)
 
         def rows(vectors):
             return vec(torch.from_numpy(np.array(part))[None, None] for part in vectors.T)
 
         phi, area = torch.tensor(distance)[None, None], torch.tensor([[3e-6]], dtype=torch.float64)
-        met = LinkPoints(((0, 2),), TILES, rows(pos), phi, rows(self.gradient), area)
-        before = {name: torch.from_numpy(value)[None] for name, value in self.memory.items()}
-        loads, found = advance([met], self.stick_slip, before)
+        points = LinkPoints(((0, 2),), TILES, rows(pos), phi, rows(self.gradient), area)
+        previous = {name: torch.from_numpy(value)[None] for name, value in self.memory.items()}
+        loads, state = advance([points], self.stick_slip, previous)
         marker, normal = (vec(part[0, 0] for part in rows(vectors)) for vectors in (self.POS, self.NORMAL))
         markers = Markers(marker, normal, *torch.tensor([2000.0, 6e-6], dtype=torch.float64))
         np.testing.assert_allclose(torch.stack(drag(loads, markers, 1), dim=-1)[0], expected, rtol=1e-12, atol=1e-22)
         for name in PLANES:
-            np.testing.assert_allclose(found[name][0], after[name], rtol=1e-12, atol=1e-18)
+            np.testing.assert_allclose(state[name][0], after[name], rtol=1e-12, atol=1e-18)
         self.memory, self.loads = after, torch.stack(loads[0].strength, dim=-1)[0, 0].numpy()
         return expected
 
@@ -101,42 +101,42 @@ START = np.array([[1e-3, 0, 0.5e-3], [-2e-3, 5e-3, 0.2e-3]])
 
 
 def test_two_points_by_hand():
-    """The printed sum for two points that move by different ways, one marker's tangent plane tilted; weights are A_p/A_ref."""
+    """The printed sum for two points that move differently, with one tilted tangent plane; weights are A_p/A_ref."""
     skin = Skin()
     assert not skin.step(START, [0.5e-3, 0.2e-3]).any()
-    way = np.array([[2e-4, -1e-4, -1e-4], [-1e-4, 3e-4, 5e-5]])
-    found = skin.step(START + way, [0.4e-3, 0.25e-3])
-    for x, n, u in zip(Skin.POS, Skin.NORMAL, found, strict=True):
+    shift = np.array([[2e-4, -1e-4, -1e-4], [-1e-4, 3e-4, 5e-5]])
+    displacements = skin.step(START + shift, [0.4e-3, 0.25e-3])
+    for x, n, u in zip(Skin.POS, Skin.NORMAL, displacements, strict=True):
         flat = np.eye(3) - np.outer(n, n)
         expected = np.zeros(3)
-        for z, s, h in zip(START + way, way, [0.6e-3, 0.75e-3], strict=True):
+        for z, s, h in zip(START + shift, shift, [0.6e-3, 0.75e-3], strict=True):
             expected += 0.5 * flat @ s * h * np.exp(-2000 * np.sum((flat @ (x - z)) ** 2))
         np.testing.assert_allclose(u, expected, rtol=1e-12)
 
 
-def test_lifting_lets_go_and_touching_again_takes_hold_anew():
-    """The standoff raises both thresholds; between them nothing changes, beyond them the way so far is forgotten."""
-    skin, way = Skin(), np.array([2e-4, 0, 0])
+def test_lifting_releases_and_touching_again_restarts():
+    """The standoff raises both thresholds; between them nothing changes, beyond them the displacement is forgotten."""
+    skin, shift = Skin(), np.array([2e-4, 0, 0])
     skin.step(START, [1e-3 - 0.5e-5, 1e-3 - 2e-5])
     np.testing.assert_array_equal(skin.memory["held"], [0, 1])
-    skin.step(START + way, [1.0, 1e-3 + 0.9e-4])
+    skin.step(START + shift, [1.0, 1e-3 + 0.9e-4])
     np.testing.assert_array_equal(skin.memory["held"], [0, 1])
     assert not skin.loads.any()  # held, but nothing presses
-    skin.step(START + way, [1.0, 0.5e-3])
-    np.testing.assert_allclose(skin.loads[1], 0.5e-3 * way, rtol=1e-12)
-    skin.step(START + way, [1.0, 1e-3 + 1.1e-4])
+    skin.step(START + shift, [1.0, 0.5e-3])
+    np.testing.assert_allclose(skin.loads[1], 0.5e-3 * shift, rtol=1e-12)
+    skin.step(START + shift, [1.0, 1e-3 + 1.1e-4])
     assert not any(skin.memory[name].any() for name in PLANES)
-    skin.step(START + way, 0.5e-3)
+    skin.step(START + shift, 0.5e-3)
     assert not skin.loads.any()
-    skin.step(START + 3 * way, 0.5e-3)
-    np.testing.assert_allclose(skin.loads, [0.5e-3 * 2 * way] * 2, rtol=1e-12)
+    skin.step(START + 3 * shift, 0.5e-3)
+    np.testing.assert_allclose(skin.loads, [0.5e-3 * 2 * shift] * 2, rtol=1e-12)
     skin.step(START, np.inf)  # the gate closed
     assert not skin.memory["held"].any()
 
 
 @pytest.mark.parametrize("gradient", [UP, np.array([0.0, 0.6, 0.8])])
 def test_the_cap_holds_exactly_and_the_anchor_is_dragged(gradient):
-    """|Π_m s| ≤ μ' h in the tangent plane of the link at the point; moving back at once unloads from there."""
+    """|Π_m s| ≤ μ' h in the link's tangent plane at the point; moving back unloads at once."""
     skin, h, slip = Skin(STICK_SLIP._replace(slip=0.5), gradient), 0.4e-3, 0.5
     flat = np.eye(3) - np.outer(gradient, gradient)
     way = np.array([3e-3, 4e-3, 1e-3])
@@ -155,13 +155,13 @@ def test_the_cap_holds_exactly_and_the_anchor_is_dragged(gradient):
     np.testing.assert_array_equal([below.memory[name] for name in PLANES], anchors)
 
 
-def test_not_a_number_comes_out_and_is_not_remembered():
+def test_nan_is_returned_and_not_remembered():
     skin = Skin(STICK_SLIP._replace(slip=0.5))
     skin.step(START, [0.5e-3, 5.0])
-    before = {name: torch.from_numpy(value)[None] for name, value in skin.memory.items()}
+    previous = {name: torch.from_numpy(value)[None] for name, value in skin.memory.items()}
     nan = torch.full((1, 1, 2), torch.nan, dtype=torch.float64)
     broken = LinkPoints(((0, 2),), TILES, (nan, nan, nan), nan, (nan, nan, nan), nan[0, :, :1])
-    loads, after = advance([broken], skin.stick_slip, before)
+    loads, after = advance([broken], skin.stick_slip, previous)
     assert loads[0].strength[0][0, 0, 0].isnan()
     for name in PLANES:
-        torch.testing.assert_close(after[name], before[name], rtol=0, atol=0)
+        torch.testing.assert_close(after[name], previous[name], rtol=0, atol=0)

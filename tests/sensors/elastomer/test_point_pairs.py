@@ -1,4 +1,4 @@
-"""Points of objects by pairs: which links have state, the gate of each, and what is refused."""
+"""Points of objects by pairs: which links have state, the gate of each pair, and refused documents."""
 
 import pytest
 import torch
@@ -22,7 +22,7 @@ PAIRS = """
 """
 
 
-def on_two_links(folder, **sensor):
+def document_of_two_links(folder, **sensor):
     (folder / "scene.xml").write_text(PAIRS)
     taxel = {"method": "points", "radius": 0.004, "points": [{"pos": [0, 0, 0.01], "normal": [0, 0, 1]}]}
     return {
@@ -33,32 +33,32 @@ def on_two_links(folder, **sensor):
     }
 
 
-def test_state_is_for_pairs_that_can_meet(tmp_path):
-    """Link b and the item never collide: under the gate it has no points; explain says what is remembered."""
-    touch = tgdsl.compile(on_two_links(tmp_path))
+def test_only_pairs_that_can_meet_have_state(tmp_path):
+    """Link b and the item never collide: with the gate they have no points. `explain` states what is remembered."""
+    touch = tgdsl.compile(document_of_two_links(tmp_path))
     assert {name: memory.shape for name, memory in touch.plan.sensors[0].state.items()} == dict.fromkeys(PLANES, (50,))
     text = touch.explain()
     assert "remembers anchor_x, anchor_y, anchor_z, held (800 bytes per environment)" in text
     assert "50 points of item against a" in text
-    both = compile_document(on_two_links(tmp_path, gate="geometric")).plan
+    both = compile_document(document_of_two_links(tmp_path, gate="geometric")).plan
     assert both.sensors[0].state["held"].shape == (100,)
-    unsheared = on_two_links(tmp_path, gate="geometric", shear_strength=0)
+    unsheared = document_of_two_links(tmp_path, gate="geometric", shear_strength=0)
     del unsheared["sensors"]["s"]["anchors"], unsheared["sensors"]["s"]["points"]
     still = compile_document(unsheared).plan
     assert not still.sensors[0].state and "points" not in still.quantities
 
 
-def test_the_gate_is_that_of_the_pair(tmp_path):
-    """Points sink in only while the simulator has the pair in contact, and let go when it has not."""
-    touch = tgdsl.compile(on_two_links(tmp_path, dilation_strength=0), dtype=torch.float64)
+def test_the_gate_is_the_pairs(tmp_path):
+    """Points sink in only while the simulator has the pair in contact, and let go otherwise."""
+    touch = tgdsl.compile(document_of_two_links(tmp_path, dilation_strength=0), dtype=torch.float64)
     assert [(pair.link, pair.object) for pair in touch.inputs.pairs] == [("a", "item")]
-    given = state(touch, pos=[0, 0, 0.0295])
-    for found, shift, reads in ((0, 0.0, False), (1, 1e-4, False), (1, 3e-4, True), (0, 4e-4, False), (1, 5e-4, False)):
-        given = state(touch, pos=[shift, 0, 0.0295])
-        given.contact_found = torch.full((1, 1), float(found))
-        readings = touch(given)["s"][0]
+    inputs = state(touch, pos=[0, 0, 0.0295])
+    for is_in_contact, shift, reads in ((0, 0.0, False), (1, 1e-4, False), (1, 3e-4, True), (0, 4e-4, False), (1, 5e-4, False)):
+        inputs = state(touch, pos=[shift, 0, 0.0295])
+        inputs.contact_found = torch.full((1, 1), float(is_in_contact))
+        readings = touch(inputs)["s"][0]
         assert bool(readings[0].any()) == reads and not readings[1].any()
-        assert bool(touch.memory.get_buffer("s:held").any()) == bool(found)
+        assert bool(touch.memory.get_buffer("s:held").any()) == bool(is_in_contact)
 
 
 REFUSED = [
@@ -78,8 +78,8 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("fields", "target", "message", "hint"), REFUSED)
-def test_what_cannot_be_is_refused_where_it_stands(tmp_path, fields, target, message, hint):
-    document = on_two_links(tmp_path)
+def test_mistakes_name_their_place(tmp_path, fields, target, message, hint):
+    document = document_of_two_links(tmp_path)
     document["objects"]["item"] |= target
     sensor = {**document["sensors"]["s"], **fields}
     document["sensors"]["s"] = {name: value for name, value in sensor.items() if value is not None}
@@ -89,16 +89,16 @@ def test_what_cannot_be_is_refused_where_it_stands(tmp_path, fields, target, mes
 
 
 @pytest.mark.parametrize("readout", ["measured", "clean", "both"])
-def test_a_mistake_is_named_once_however_a_sensor_is_read(tmp_path, readout):
-    """A sensor that is read both ways with noise of its radii is computed twice, and has one place in the document."""
-    document = on_two_links(tmp_path, readout=readout, noise={"radius_noise": 0.1}, feels=["item", "floor"])
+def test_a_mistake_is_named_once_whatever_the_readout(tmp_path, readout):
+    """A sensor with both readouts and radius noise is computed twice, but has one place in the document."""
+    document = document_of_two_links(tmp_path, readout=readout, noise={"radius_noise": 0.1}, feels=["item", "floor"])
     with pytest.raises(SpecError) as caught:
         compile_document(document)
     assert [problem.path for problem in caught.value.problems] == ["sensors.s.feels[1]"]
 
 
 def test_the_papers_model_anchors_points(tmp_path):
-    document = on_two_links(tmp_path, model="paper")
+    document = document_of_two_links(tmp_path, model="paper")
     del document["sensors"]["s"]["anchors"]
     spec = load(document).spec.sensors["s"]
     assert isinstance(spec, ElastomerSpec) and spec.anchored == "points"

@@ -1,4 +1,4 @@
-"""Skins by name: their numbers against their sources, what a sensor may override, and what is said of them."""
+"""Skins by name: their numbers against their sources, what a sensor may override, and what `explain` states."""
 
 import numpy as np
 import pytest
@@ -40,10 +40,10 @@ WIDE = """<mujoco><worldbody>
 
 
 @pytest.mark.parametrize(("skin", "poissons_ratio"), [("soft_gel", 0.0), ("firm_rubber", 0.3), ("soft_gel", 0.48)])
-def test_a_layer_that_is_dragged_all_over_follows_the_drag(tmp_path, skin, poissons_ratio):
-    """Simple shear: markers on the surface of what sticks everywhere move with it, whatever E and ν; here of a pad of finite size.
+def test_a_layer_dragged_everywhere_follows_the_drag(tmp_path, skin, poissons_ratio):
+    """Simple shear of a finite pad: markers on a surface that sticks everywhere move with it, whatever E and ν.
 
-    The field of a taxel's patch is that of a disc, which overlaps its neighbours: 8 % at 2 mm on a layer of 2 mm.
+    The field of a taxel's patch is a disc's, which overlaps its neighbours: 8 % at 2 mm on a layer of 2 mm.
     """
     (tmp_path / "scene.xml").write_text(WIDE)
     line = np.linspace(-0.02, 0.02, 21)
@@ -70,8 +70,8 @@ def test_a_layer_that_is_dragged_all_over_follows_the_drag(tmp_path, skin, poiss
     for share in np.linspace(0, 1, 6):
         item = torch.tensor([share * drag, 0, 0.02 - 5e-5], dtype=torch.float64)
         pos[0, touch.inputs.bodies.index("item")] = item
-        found = touch(tgdsl.SceneState(body_pos=pos, body_quat=quat, contact_found=torch.ones(1, 1)))["s"]
-    centre = found[0, len(points) // 2].numpy()
+        readings = touch(tgdsl.SceneState(body_pos=pos, body_quat=quat, contact_found=torch.ones(1, 1)))["s"]
+    centre = readings[0, len(points) // 2].numpy()
     assert centre[0] == pytest.approx(drag, rel=0.08)
     assert abs(centre[1]) < 1e-3 * drag
 
@@ -86,8 +86,8 @@ def test_the_papers_gel_has_the_papers_numbers():
 
 
 @pytest.mark.parametrize(("name", "shore", "more"), [("soft_gel", 10.0, -0.05), ("firm_rubber", 50.0, 0.40)])
-def test_moduli_are_those_of_the_hardness(name, shore, more):
-    """Gent's relation, and how far Ruess' is from it."""
+def test_moduli_follow_from_the_hardness(name, shore, more):
+    """Gent's relation, and the deviation of Ruess' from it."""
     young = spec(like=name).youngs_modulus
     assert young is not None
     gent = 0.0981 * (56 + 7.62336 * shore) / (0.137505 * (254 - 2.54 * shore)) * 1e6
@@ -98,7 +98,7 @@ def test_moduli_are_those_of_the_hardness(name, shore, more):
 
 @pytest.mark.parametrize("fields", [{}, {"thickness": "1 mm"}, {"youngs_modulus": "0.2 MPa"}, {"poissons_ratio": 0.3}])
 def test_the_normal_stiffness_is_the_layers(fields):
-    """Isotropic elasticity with ε_xx = ε_yy = 0: σ_zz over the depth is λ + 2 μ over t."""
+    """Isotropic elasticity with ε_xx = ε_yy = 0: σ_zz over the depth is (λ + 2 μ)/t."""
     skin = spec(like="soft_gel", **fields)
     young, nu, thickness = skin.youngs_modulus, skin.poissons_ratio, skin.thickness
     assert young is not None and thickness is not None
@@ -107,7 +107,7 @@ def test_the_normal_stiffness_is_the_layers(fields):
     assert spec(like="soft_gel", normal_stiffness=7e8, **fields).normal_stiffness == 7e8
 
 
-def test_single_fields_override():
+def test_single_fields_override_a_skin():
     skin = spec(like="firm_rubber", thickness="1 mm", friction=0.8)
     assert (skin.thickness, skin.friction, skin.youngs_modulus) == (1e-3, 0.8, SKINS["firm_rubber"]["youngs_modulus"])
     half = spec(like="firm_rubber", kernel="half_space")
@@ -119,8 +119,8 @@ def test_single_fields_override():
 
 
 @pytest.mark.parametrize("name", SKINS)
-def test_a_skin_reads_what_its_numbers_read(tmp_path, name):
-    """Named, written out, and kept in a file: the same readings to the last bit."""
+def test_a_skin_reads_like_its_numbers(tmp_path, name):
+    """Named, written out, and loaded from a file: the same readings to the last bit."""
     written = {**SKINS[name]}
     if written["kernel"] != "gaussian":
         written["normal_stiffness"] = spec(like=name).normal_stiffness
@@ -131,15 +131,15 @@ def test_a_skin_reads_what_its_numbers_read(tmp_path, name):
     readings = []
     for touch in (named, plain, again):
         for seed in range(3):
-            found = touch(named.example_state(8, seed=seed, spread=0.01))["s"]
-        readings.append(found)
+            reading = touch(named.example_state(8, seed=seed, spread=0.01))["s"]
+        readings.append(reading)
     assert readings[0].any() and np.isfinite(readings[0].numpy()).all()
     for other in readings[1:]:
         torch.testing.assert_close(other, readings[0], rtol=0, atol=0)
     assert load_plan(tmp_path / "hand.safetensors").to_json() == named.plan.to_json()
 
 
-def test_explain_says_what_it_came_to(tmp_path):
+def test_explain_states_the_resulting_values(tmp_path):
     fields = "like: soft_gel, thickness: 1 mm, readout: both, noise: {radius_noise: 1e-4}"
     text = tgdsl.compile(document(tmp_path, fields)).explain()
     young = SKINS["soft_gel"]["youngs_modulus"]
@@ -166,7 +166,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("fields", WRONG)
-def test_what_is_wrong_is_named_where_it_stands(tmp_path, fields):
+def test_mistakes_name_their_place(tmp_path, fields):
     path = document(tmp_path, fields)
     with pytest.raises(SpecError) as caught:
         tgdsl.compile(path)
@@ -175,5 +175,5 @@ def test_what_is_wrong_is_named_where_it_stands(tmp_path, fields):
     assert problem.line == 5
 
 
-def test_editors_complete_the_names():
+def test_the_schema_lists_the_skins():
     assert json_schema()["$defs"]["ElastomerSpec"]["properties"]["like"]["enum"] == list(SKINS)

@@ -1,4 +1,4 @@
-"""The shares of contacts, without a scene: against loops in NumPy, against scipy's minimiser, and against what they promise."""
+"""The shares of contacts, without a scene: against loops in NumPy, SciPy's minimiser, and their guarantees."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from tgdsl.sensors.force_taxel.footprint import LEVENBERG, footprint, reference
 
 RADIUS = 0.01
 TOLERANCE = 1e-12
-"""Both are float64 and take the same steps; where the moment is out of reach a step's system has a condition of 1e4."""
+"""Both are float64 and take the same steps; with the moment out of reach a step's system has a condition of 1e4."""
 
 
 def pad(spacing=0.005, num=8):
@@ -19,18 +19,18 @@ def pad(spacing=0.005, num=8):
 
 
 def contacts(rng, num, half=0.012, height=0.0, shear=0.4):
-    """Contacts on the pad, which push it down."""
+    """Return contacts on the pad that push it down."""
     point = np.column_stack([rng.uniform(-half, half, (num, 2)), np.full(num, height)])
     force = rng.uniform(0.2, 1.0, (num, 1)) * np.column_stack([shear * rng.uniform(-1, 1, (num, 2)), -np.ones(num)])
     return point, force, np.zeros((num, 3))
 
 
 def up(pos):
-    """Normals of taxels on a flat pad."""
+    """Return the normals of taxels on a flat pad."""
     return np.tile([0.0, 0.0, 1.0], (len(pos), 1))
 
 
-def shared(
+def shares_of(
     pos,
     point,
     force,
@@ -43,7 +43,7 @@ def shared(
     outward=None,
     normal=None,
 ):
-    """Return the shares (contact, taxel) and the residual of one environment; of contacts from above, if nothing is said."""
+    """Return the shares (contact, taxel) and the residual of one environment; by default contacts are from above."""
     outward, normal = up(pos) if outward is None else outward, -up(point) if normal is None else normal
     depth = np.full(len(pos), 0.5) if depth is None else depth
     is_active = np.ones(len(pos), dtype=bool) if is_active is None else is_active
@@ -60,8 +60,8 @@ def shared(
     return result.share[0].numpy(), np.array([float(part[0]) for part in result.residual])
 
 
-def left_over(pos, point, force, torque, share):
-    """Return Σ_c Σ_j share_cj ((x_c − x_j) × f_c + τ_c): what the residual is by definition."""
+def residual_moment(pos, point, force, torque, share):
+    """Return Σ_c Σ_j share_cj ((x_c − x_j) × f_c + τ_c), the residual by definition."""
     arms = point[:, None] - pos[None]
     couple = np.cross(arms, force[:, None]) + torque[:, None]
     return (share[..., None] * couple).sum(axis=(0, 1))
@@ -69,8 +69,8 @@ def left_over(pos, point, force, torque, share):
 
 @pytest.mark.parametrize("steps", [0, 1, 4, 12])
 @pytest.mark.parametrize("half", [0.012, 0.03])
-def test_shares_are_those_of_the_loops(steps, half):
-    """In reach and out of it, with inactive taxels, with torques, with contacts of no force."""
+def test_shares_match_the_loops(steps, half):
+    """In reach and out of it, with inactive taxels, with torques, and with contacts of zero force."""
     rng = np.random.default_rng(steps)
     pos, is_active, worst = pad(), rng.random(64) > 0.1, 0.0
     for _ in range(5):
@@ -80,26 +80,26 @@ def test_shares_are_those_of_the_loops(steps, half):
         depth = rng.uniform(0, 1, 64)
         sides = rng.normal([0, 0, 1], 0.5, (64, 3)), rng.normal([0, 0, -1], 0.5, (3, 3))
         outward, normal = (side / np.linalg.norm(side, axis=1)[:, None] for side in sides)
-        share, residual = shared(pos, point, force, torque, depth, steps, is_active, outward=outward, normal=normal)
+        share, residual = shares_of(pos, point, force, torque, depth, steps, is_active, outward=outward, normal=normal)
         contact = point, force, torque, normal
-        expected, left = reference(pos, is_active, depth, outward, *contact, RADIUS, (LEVENBERG,) * steps)
+        expected, expected_residual = reference(pos, is_active, depth, outward, *contact, RADIUS, (LEVENBERG,) * steps)
         np.testing.assert_allclose(share, expected, atol=TOLERANCE)
-        np.testing.assert_allclose(residual, left, atol=TOLERANCE * RADIUS)
-        np.testing.assert_allclose(residual, left_over(pos, point, force, torque, share), atol=1e-15)
+        np.testing.assert_allclose(residual, expected_residual, atol=TOLERANCE * RADIUS)
+        np.testing.assert_allclose(residual, residual_moment(pos, point, force, torque, share), atol=1e-15)
         assert not share[:, ~is_active].any()
         worst = max(worst, np.abs(share).max())
     assert worst > 0.05
 
 
-def test_the_shares_are_those_of_least_relative_entropy():
-    """Scipy minimises Σ_c |f_c| Σ_j λ_cj ln(λ_cj/λ⁰_cj) over all shares that have the contacts' moment, and knows no dual."""
+def test_shares_have_the_least_relative_entropy():
+    """SciPy minimises Σ_c |f_c| Σ_j λ_cj ln(λ_cj/λ⁰_cj) over all shares with the contacts' moment, without a dual."""
     rng = np.random.default_rng(5)
     pos = pad(0.006, 5)
     point, force, torque = contacts(rng, 2, 0.006, shear=0.3)
     point[1] = point[0] + [0.003, -0.002, 0]
     depth = rng.uniform(0.2, 1, 25)
-    prior, _ = shared(pos, point, force, torque, depth, steps=0)
-    found, residual = shared(pos, point, force, torque, depth, steps=20)
+    prior, _ = shares_of(pos, point, force, torque, depth, steps=0)
+    shares, residual = shares_of(pos, point, force, torque, depth, steps=20)
     assert np.abs(residual).max() < 1e-15
     at = np.argwhere(prior > 0)
     weight, first = np.linalg.norm(force, axis=1)[at[:, 0]], prior[at[:, 0], at[:, 1]]
@@ -119,95 +119,99 @@ def test_the_shares_are_those_of_least_relative_entropy():
         constraints={"type": "eq", "fun": lambda s: rows @ s - [1, 1, 0, 0, 0], "jac": lambda s: rows},
         options={"ftol": 1e-14, "maxiter": 500},
     )
-    ours = found[at[:, 0], at[:, 1]]
-    assert np.abs(ours - first).max() > 0.01  # the moment does ask for something
+    ours = shares[at[:, 0], at[:, 1]]
+    assert np.abs(ours - first).max() > 0.01  # the moment requires a correction
     np.testing.assert_allclose(rows @ ours, [1, 1, 0, 0, 0], atol=1e-12)
     np.testing.assert_allclose(ours, result.x, atol=2e-5)
     assert entropy(ours) <= result.fun + 1e-9
 
 
-def test_a_small_correction_is_the_least_norm_one():
+def test_a_small_correction_has_the_least_norm():
     """To first order in the moment: λ = λ⁰ (1 + β · (g − ḡ)), β from the covariance of g under λ⁰."""
     pos = pad()
     point, force, torque = np.array([[0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, -1.0]]), np.zeros((1, 3))
-    prior, _ = shared(pos, point, force, torque, steps=0)
+    prior, _ = shares_of(pos, point, force, torque, steps=0)
     g = np.cross(pos - point, force) / RADIUS
     covariance = (prior[0, :, None, None] * g[:, :, None] * g[:, None]).sum(axis=0)[:2, :2]
     for size in (1e-3, 1e-4):  # the error is of second order
         torque = np.array([[size, -0.5 * size, 0]]) * RADIUS
         beta = np.linalg.solve(covariance, [size, -0.5 * size])
-        share, _ = shared(pos, point, force, torque, steps=8)
+        share, _ = shares_of(pos, point, force, torque, steps=8)
         linear = prior[0] * (1 + g[:, :2] @ beta)
         np.testing.assert_allclose(share[0], linear, atol=10 * size**2)
 
 
-def test_four_steps_suffice_where_the_moment_is_in_reach():
-    """Contacts anywhere in the middle of the pad: four steps leave little of force times footprint, and twelve leave less.
+def test_four_steps_suffice_if_the_moment_is_in_reach():
+    """Contacts in the middle of the pad: four steps leave little of force times footprint, and twelve leave less.
 
-    Where contacts' forces differ in direction, one direction of β has hardly any effect, and is the last to be found.
+    If contacts' forces differ in direction, one direction of β has hardly any effect and converges last.
     """
     rng = np.random.default_rng(7)
-    left = []
+    residuals = []
     for _ in range(40):
         point, force, torque = contacts(rng, 1 + rng.integers(4), 0.008)
         depth, scale = rng.uniform(0.1, 1, 64), np.linalg.norm(force, axis=1).sum() * RADIUS
-        left.append([np.linalg.norm(shared(pad(), point, force, torque, depth, steps)[1]) / scale for steps in (0, 4, 12)])
-    none, four, twelve = np.array(left).T
-    assert np.median(none) > 0.02
+        residuals.append(
+            [np.linalg.norm(shares_of(pad(), point, force, torque, depth, steps)[1]) / scale for steps in (0, 4, 12)]
+        )
+    zero, four, twelve = np.array(residuals).T
+    assert np.median(zero) > 0.02
     assert np.median(four) < 1e-4
     assert four.max() < 5e-3
     assert np.median(twelve) < 1e-8
     assert (twelve <= 1.01 * four + 1e-15).all()
 
 
-def test_more_steps_never_leave_more():
-    """Also where the moment is out of reach, and with depths that span three decades: no step makes the residual grow for good."""
+def test_more_steps_never_increase_the_residual():
+    """With the moment out of reach, too, and depths over three decades: no step increases the residual for good."""
     rng = np.random.default_rng(8)
     for _ in range(15):
         point, force, torque = contacts(rng, 2, 0.025, height=rng.uniform(-0.003, 0.003), shear=1.0)
         depth, scale = 10 ** rng.uniform(-3, 0, 64) * (rng.random(64) > 0.5), np.linalg.norm(force, axis=1).sum() * RADIUS
-        left = [np.linalg.norm(shared(pad(), point, force, torque, depth, steps)[1]) / scale for steps in (0, 4, 16, 48)]
-        assert np.all(np.isfinite(left))
-        assert left[1] <= left[0] + 1e-3
-        assert left[2] <= left[1] + 1e-3
-        assert left[3] <= left[2] + 1e-9
+        residuals = [
+            np.linalg.norm(shares_of(pad(), point, force, torque, depth, steps)[1]) / scale for steps in (0, 4, 16, 48)
+        ]
+        assert np.all(np.isfinite(residuals))
+        assert residuals[1] <= residuals[0] + 1e-3
+        assert residuals[2] <= residuals[1] + 1e-3
+        assert residuals[3] <= residuals[2] + 1e-9
 
 
 def test_a_single_row_has_no_moment_about_itself():
-    """A force beside a row of taxels: along the row the place is met, across it the couple is left and is named."""
+    """A force next to a row of taxels: along the row its place is met; across it, the couple remains as the residual."""
     pos = pad()[3::8]  # a row along x, at y of −2.5 mm
     assert np.ptp(pos[:, 1]) == 0
     point, force = np.array([[0.0012, pos[0, 1] + 0.002, 0.0]]), np.array([[0.0, 0.0, -2.0]])
-    share, residual = shared(pos, point, force, np.zeros((1, 3)), steps=12)
+    share, residual = shares_of(pos, point, force, np.zeros((1, 3)), steps=12)
     assert share.sum() == pytest.approx(1, abs=1e-14)
     np.testing.assert_allclose(share[0] @ pos[:, 0], 0.0012, atol=1e-12)
     np.testing.assert_allclose(residual, [-2.0 * 0.002, 0, 0], atol=1e-12)
 
 
 def test_a_split_contact_counts_as_one():
-    """The same place and direction in unequal parts, beside another contact: the taxels' forces are the same."""
+    """One place and direction in unequal parts, next to another contact: the taxels' forces do not change."""
     rng = np.random.default_rng(9)
     point, force, torque = contacts(rng, 2, 0.02)
     torque = 1e-3 * rng.normal(size=(2, 3))
     depth = rng.uniform(0, 1, 64)
-    share, residual = shared(pad(), point, force, torque, depth)
+    share, residual = shares_of(pad(), point, force, torque, depth)
     split = [np.concatenate([v[:1] * part, v[:1] * (1 - part), v[1:]]) for v, part in ((force, 0.3), (torque, 0.3))]
-    parts, left = shared(pad(), point[[0, 0, 1]], *split, depth)
+    parts, split_residual = shares_of(pad(), point[[0, 0, 1]], *split, depth)
     np.testing.assert_allclose(parts.T @ split[0], share.T @ force, atol=TOLERANCE)
-    np.testing.assert_allclose(left, residual, atol=TOLERANCE * RADIUS)
+    np.testing.assert_allclose(split_residual, residual, atol=TOLERANCE * RADIUS)
 
 
-def test_what_is_captured_fades_with_distance():
-    """All of a contact up to half a footprint from the outermost taxel, nothing from a whole one, by the smooth step between."""
+def test_capture_fades_with_distance():
+    """A contact is captured up to half a footprint from the outermost taxel and missed from a whole one; the step is smooth."""
     pos, force = np.zeros((1, 3)), np.array([[0.1, 0.0, -1.0]])
     for distance, expected in ((0.0, 1), (0.5, 1), (0.5 + 1e-9, 1), (np.sqrt(0.625), 0.5), (1.0, 0), (1.5, 0), (100.0, 0)):
         point = np.array([[distance * RADIUS, 0, 0]])
-        share, _ = shared(pos, point, force, np.zeros((1, 3)))
+        share, _ = shares_of(pos, point, force, np.zeros((1, 3)))
         assert share.sum() == pytest.approx(expected, abs=1e-12), distance
 
 
-def turned(cosine):
-    """A contact's normal that has an angle of this cosine to straight down."""
+def tilted_normal(cosine):
+    """Return a contact's normal whose angle to straight down has this cosine."""
     return np.array([[np.sqrt(1 - cosine**2), 0.0, -cosine]])
 
 
@@ -215,27 +219,29 @@ def turned(cosine):
     ("cosine", "expected"), [(1, 1), (0.5, 1), (0.375, 1), (0.1875, 0.5), (0.09375, 0.15625), (0, 0), (-0.2, 0), (-1, 0)]
 )
 def test_a_contact_is_captured_by_taxels_on_its_side(cosine, expected):
-    """At a taxel, κ is twice the cosine up to 1 and t is 4/3 of that: γ = t²(3 − 2t), whatever way the force points."""
+    """At a taxel, κ is twice the cosine up to 1, and t is 4/3 of that: γ = t²(3 − 2t), whatever the force's direction."""
     for force in ([[0.0, 0.0, -1.0]], [[0.3, 0.2, 1.0]]):
-        share, _ = shared(np.zeros((1, 3)), np.zeros((1, 3)), np.array(force), np.zeros((1, 3)), normal=turned(cosine))
+        share, _ = shares_of(
+            np.zeros((1, 3)), np.zeros((1, 3)), np.array(force), np.zeros((1, 3)), normal=tilted_normal(cosine)
+        )
         assert share.sum() == pytest.approx(expected, abs=1e-12)
 
 
-def test_taxels_that_face_a_contact_more_carry_more():
-    """Two taxels as near and as deep, one at right angles to the other: κ of 1 and 1/2 by a contact at 60° and near 30°."""
+def test_taxels_that_face_a_contact_carry_more():
+    """Two equally near and deep taxels at right angles: κ of 1 and 1/2 by a contact at 60° and near 30°."""
     pos, outward = np.array([[0.003, 0, 0], [-0.003, 0, 0]]), np.array([[0.0, 0, 1], [1.0, 0, 0]])
     for cosine, expected in ((np.sqrt(15) / 4, [0.8, 0.2]), (1.0, [1, 0]), (0.0, [0, 1])):
-        normal = -turned(cosine) * [[1, 1, -1]]
-        share, _ = shared(
+        normal = -tilted_normal(cosine) * [[1, 1, -1]]
+        share, _ = shares_of(
             pos, np.zeros((1, 3)), np.array([[0, 0, -1.0]]), np.zeros((1, 3)), steps=0, outward=outward, normal=normal
         )
         np.testing.assert_allclose(share[0], expected, atol=1e-12)
 
 
-def test_forces_are_continuous_as_a_contact_goes_around_a_finger():
-    """A ball rolls around a round finger of 8 mm whose front has taxels: to the back all is handed over, without a jump.
+def test_forces_are_continuous_as_a_contact_rounds_a_finger():
+    """A ball rolls around a finger of 8 mm with taxels in front: at the back all force is missed, without a jump.
 
-    The back is 16 mm from the front, nearer than the footprint reaches.
+    The back is 16 mm from the front, within the footprint's reach.
     """
     angle = np.radians(np.linspace(-80, 80, 9))
     outward = np.array([[np.sin(a), 0, np.cos(a)] for a in angle for _ in range(3)])
@@ -243,13 +249,15 @@ def test_forces_are_continuous_as_a_contact_goes_around_a_finger():
     depth = np.random.default_rng(4).uniform(0, 1, len(pos))
 
     def roll(num):
-        found = []
+        path = []
         for a in np.linspace(0, np.pi, num):
             out = np.array([[np.sin(a), 0, np.cos(a)]])
             force = -out + [[0, 0.3, 0]]
-            share, left = shared(pos, 0.008 * out, force, np.zeros((1, 3)), depth, outward=outward, normal=-out, radius=0.02)
-            found.append(np.concatenate([(share.T @ force).ravel(), left / 0.02, [share.sum()]]))
-        return np.array(found)
+            share, residual = shares_of(
+                pos, 0.008 * out, force, np.zeros((1, 3)), depth, outward=outward, normal=-out, radius=0.02
+            )
+            path.append(np.concatenate([(share.T @ force).ravel(), residual / 0.02, [share.sum()]]))
+        return np.array(path)
 
     coarse, fine = roll(101), roll(201)
     np.testing.assert_array_equal(coarse[-1], 0)
@@ -260,7 +268,7 @@ def test_forces_are_continuous_as_a_contact_goes_around_a_finger():
 
 
 def test_forces_are_continuous_as_a_contact_slides_off():
-    """Over the pad's edge and beyond, no force jumps, and halving the step halves the change."""
+    """Over the pad's edge and beyond no force jumps, and halving the step halves the change."""
     pos, force = pad(), np.array([[0.3, -0.2, -1.0], [0, 0, -0.5]])
     depth = np.random.default_rng(3).uniform(0, 1, 64)
 
@@ -290,23 +298,23 @@ def test_forces_are_continuous_as_a_contact_slides_off():
     assert fine == pytest.approx(coarse / 2, rel=0.2)
 
 
-def test_a_contact_that_appears_begins_with_nothing():
-    """A second contact of force ε, in reach and at the edge of it, changes every taxel's force by no more than some ε."""
+def test_a_new_contact_starts_from_zero():
+    """A second contact of force ε, in reach and at its edge, changes each taxel's force by at most a few ε."""
     rng = np.random.default_rng(12)
     for x in (0.004, 0.024, 0.0268):
         point, force, _ = contacts(rng, 2)
         point[1] = [x, 0.002, 0.0]
         depth = rng.uniform(0, 1, 64)
-        alone, left = shared(pad(), point[:1], force[:1], np.zeros((1, 3)), depth)
+        alone, residual = shares_of(pad(), point[:1], force[:1], np.zeros((1, 3)), depth)
         for size in (1e-3, 1e-6, 1e-9):
-            both, rest = shared(pad(), point, force * [[1], [size]], np.zeros((2, 3)), depth)
+            both, total_residual = shares_of(pad(), point, force * [[1], [size]], np.zeros((2, 3)), depth)
             np.testing.assert_allclose(both.T @ (force * [[1], [size]]), alone.T @ force[:1], atol=20 * size)
-            np.testing.assert_allclose(rest, left, atol=20 * size * RADIUS)
+            np.testing.assert_allclose(total_residual, residual, atol=20 * size * RADIUS)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_derivatives_are_finite_without_a_force(dtype):
-    """Unused slots at the origin, a contact at a taxel, contacts of no force, contacts beyond reach: no infinity, no NaN."""
+    """Unused slots at the origin, a contact at a taxel, zero forces, contacts out of reach: no infinity, no NaN."""
     pos = torch.tensor(pad().T, dtype=dtype)
     point = torch.tensor([[0, 0, 0], [0.0025, 0.0025, 0], [1.0, 1.0, 0], [0.0275, 0.0175, 0]], dtype=dtype).T[:, None]
     for force in (torch.zeros(3, 1, 4, dtype=dtype), torch.tensor([0.0, 0, -1], dtype=dtype)[:, None, None].repeat(1, 1, 4)):

@@ -1,4 +1,4 @@
-"""Force taxels against their reference, and contacts made by hand: no force is lost, made up, or pushed where none can be."""
+"""Force taxels against their reference, and handmade contacts: no force is lost, invented, or applied where none can be."""
 
 import dataclasses
 import subprocess
@@ -29,21 +29,21 @@ class TestForceTaxel(KindConformance):
     kind = FORCE_TAXEL
     float64_tolerance = 1e-11  # a step towards the moment solves a system of condition up to 1e3, and there are four
 
-    def test_what_is_missed_and_left_over_are_the_references(self, scene):
+    def test_missed_force_and_residual_match_the_reference(self, scene):
         module, reference = self.build(self.document(scene), torch.float64)
         for state in self.states(module):
             readings = module(state)
             for env in range(self.num_envs):
-                felt = reference.gathered(state, env, np.zeros(3))
-                _, missed, residual = reference_reports(reference.spec, reference.layout, felt)
+                gathered = reference.gathered(state, env, np.zeros(3))
+                _, missed, residual = reference_reports(reference.spec, reference.layout, gathered)
                 np.testing.assert_allclose(readings["s/missed"][env], missed, atol=1e-11)
                 np.testing.assert_allclose(readings["s/residual"][env], residual, atol=1e-12)
             assert readings["s/missed"].abs().max() > 0.1
             assert readings["s/residual"].abs().max() > 1e-4
 
     @pytest.mark.filterwarnings("ignore:contacts of")
-    def test_what_slots_lack_is_shared_out_as_in_the_reference(self, scene):
-        """Pairs whose net force is that of more contacts than are shown: the definition adds it up one contact at a time."""
+    def test_force_beyond_the_slots_is_shared_out_as_in_the_reference(self, scene):
+        """The net force includes contacts that are not shown: the definition adds it up one contact at a time."""
         module, reference = self.build(self.document(scene), torch.float64)
         for state in self.states(module):
             lacking = torch.randn(state.contact_netforce.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
@@ -54,7 +54,7 @@ class TestForceTaxel(KindConformance):
 class TestForceTaxelWithPressure(KindConformance):
     kind = FORCE_TAXEL
     parameters = {"outputs": ["pressure", "force"], "footprint": 0.02, "moment_iterations": 2, "slots": 2}
-    test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
+    test_compiled_equals_eager = None  # its graph is part of another kind's
     float64_tolerance = 1e-11
 
 
@@ -62,8 +62,8 @@ class TestForceTaxelWithPressure(KindConformance):
 
 
 @pytest.mark.filterwarnings("ignore:contacts of pad – cube are more than `slots")
-def test_every_newton_is_somewhere(tmp_path):
-    """Random contacts on, beside and far from the pad, more of them than slots, in float32: Σ f + missed = net to rounding."""
+def test_no_force_is_lost(tmp_path):
+    """Random contacts on, next to and far from the pad, more than slots, in float32: Σ f + missed = net up to rounding."""
     rng = np.random.default_rng(0)
     touch = pad(tmp_path, dtype=torch.float32, slots=3)
     for _ in range(20):
@@ -84,7 +84,7 @@ def test_a_contact_far_from_all_taxels_is_missed(tmp_path):
 
 @pytest.mark.filterwarnings("ignore:contacts of pad – cube are more than `slots")
 def test_contacts_beyond_the_slots_act_where_the_others_do(tmp_path):
-    """A cube rests on four points; with one slot the taxels around that one carry them all, and none of it is lost."""
+    """A cube rests on four points; with one slot the taxels around that point carry the whole force."""
     touch = pad(tmp_path, slots=1)
     state = settled(touch)
     assert state.contact_found[0, 0] == 4
@@ -97,7 +97,7 @@ def test_contacts_beyond_the_slots_act_where_the_others_do(tmp_path):
 
 
 def test_a_contact_that_slides_off_hands_its_force_over(tmp_path):
-    """From the pad's middle to beyond its reach: force and missed always sum to the contact's, and neither ever jumps."""
+    """From the pad's middle to beyond its reach: force and missed force sum to the contact's, without a jump."""
     touch = pad(tmp_path)
     force = np.array([0.4, 0.0, -1.0])
     captured = []
@@ -115,7 +115,7 @@ def test_a_contact_that_slides_off_hands_its_force_over(tmp_path):
 
 
 def test_a_contact_that_turns_around_an_edge_hands_its_force_over(tmp_path):
-    """A ball rolls over the edge of the pad at the outermost taxels: the normal turns, and by a right angle all is missed."""
+    """A ball rolls over the pad's edge at the outermost taxels: once the normal has turned by a right angle, all force is missed."""
     touch = pad(tmp_path)
     forces = []
     for angle in np.linspace(0, np.pi / 2, 76):
@@ -133,10 +133,10 @@ HANDS = {"xhand1": "*_link2", "sharpa": "*_elastomer"}
 
 
 @pytest.mark.parametrize(("hand", "side"), [("xhand1", "right"), ("sharpa", "left")])
-def test_the_nail_is_not_the_pad(hand, side):
-    """What presses on the back of a fingertip is missed, though within the footprint of the pad's taxels; what presses there is not.
+def test_force_on_the_nail_is_missed(hand, side):
+    """Force on the back of a fingertip is missed, though within the footprint of the pad's taxels; force on the pad is not.
 
-    The back is the farthest triangle of the link's mesh behind the taxel in the pad's middle.
+    The back is the farthest triangle of the link's mesh behind the taxel in the middle of the pad.
     """
     folder = Path(__file__).parents[3] / "robots" / hand
     model = folder / f"{hand}_{side}.xml"
@@ -155,9 +155,9 @@ def test_the_nail_is_not_the_pad(hand, side):
     bodies = touch.outputs[0].bodies
     assert len(bodies) == 5
     for row, body in enumerate(bodies):
-        own = taxels[taxels["body"] == body]
-        middle = own[np.linalg.norm(own["pos"] - own["pos"].mean(axis=0), axis=1).argmin()]
-        back, outward = behind(compiled, body, middle["pos"], middle["normal"])
+        body_taxels = taxels[taxels["body"] == body]
+        middle = body_taxels[np.linalg.norm(body_taxels["pos"] - body_taxels["pos"].mean(axis=0), axis=1).argmin()]
+        back, outward = exit_point(compiled, body, middle["pos"], middle["normal"])
         assert 0.008 < np.linalg.norm(back - middle["pos"]) < 0.025
         for pos, normal, missed in ((middle["pos"], middle["normal"], 0.0), (back, outward, 1.0)):
             state = touch.example_state(1)
@@ -173,8 +173,8 @@ def test_the_nail_is_not_the_pad(hand, side):
             np.testing.assert_allclose(readings["s"][0].sum(dim=0), (missed - 1) * normal, atol=ROUNDING)
 
 
-def behind(model, body, start, normal):
-    """Return where the line from a place into a body leaves its meshes, and the outward normal there."""
+def exit_point(model, body, start, normal):
+    """Return where a line from a place into a body leaves its meshes, and the outward normal there."""
     corners = []
     for geom in np.flatnonzero(model.geom_bodyid == model.body(body).id):
         mesh, rotation = model.geom_dataid[geom], np.zeros(9)
@@ -194,8 +194,8 @@ def behind(model, body, start, normal):
     return at[last], out[last] / np.linalg.norm(out[last])
 
 
-def test_no_taxel_leaves_the_contacts_cone(tmp_path):
-    """Any contacts of one normal whose forces lie in a friction cone: so does every taxel's, whatever moment they must meet."""
+def test_no_taxel_force_leaves_the_contacts_cone(tmp_path):
+    """For contacts of one normal with forces in a friction cone, each taxel's force is in the cone, whatever the moment."""
     rng = np.random.default_rng(2)
     touch, friction = pad(tmp_path, moment_iterations=8), 0.6
     num_sheared = 0
@@ -220,18 +220,18 @@ def test_splitting_a_contact_changes_nothing(tmp_path):
         torch.testing.assert_close(split[name], reading, rtol=0, atol=ROUNDING)
 
 
-def test_contacts_come_in_any_order(tmp_path):
+def test_the_order_of_contacts_does_not_matter(tmp_path):
     touch, rng = pad(tmp_path), np.random.default_rng(4)
     pos = np.column_stack([rng.uniform(-0.03, 0.03, (6, 2)), np.full(6, 0.01)])
     force, order = rng.normal(size=(6, 3)), rng.permutation(6)
     expected = touch(made_up(touch, pos, force))
-    found = touch(made_up(touch, pos[order], force[order]))
+    readings = touch(made_up(touch, pos[order], force[order]))
     for name, reading in expected.items():
-        torch.testing.assert_close(found[name], reading, rtol=0, atol=ROUNDING)
+        torch.testing.assert_close(readings[name], reading, rtol=0, atol=ROUNDING)
 
 
-def test_the_two_bodies_of_a_sensor_are_told_apart(tmp_path):
-    """Each body's contacts go to its own taxels, however near those of the other are."""
+def test_the_bodies_of_a_sensor_are_separate(tmp_path):
+    """Each body's contacts go to its own taxels, however near the other body's are."""
     text = (
         "<mujoco><worldbody><body name='a'><geom size='.02'/></body><body name='b'><geom size='.02'/></body>"
         "<body name='cube'><freejoint/><geom size='.02'/></body></worldbody></mujoco>"
@@ -262,8 +262,8 @@ def test_the_two_bodies_of_a_sensor_are_told_apart(tmp_path):
     assert not readings["s/missed"].any()
 
 
-def test_pressure_is_the_force_inwards_over_the_area(tmp_path):
-    """π R² for a taxel that is given no area; what pulls has no pressure."""
+def test_pressure_is_the_inward_force_over_the_area(tmp_path):
+    """π R² for a taxel without a given area; pulling forces have no pressure."""
     touch = pad(tmp_path, outputs=["pressure", "force"])
     for sign in (1, -1):
         reading = touch(made_up(touch, [[0.003, 0.002, 0.01]], [[0.1, 0.2, -sign * 1.5]]))["s"][0].numpy()
@@ -275,7 +275,7 @@ def test_pressure_is_the_force_inwards_over_the_area(tmp_path):
 
 
 class NoSurfaces:
-    """No surface is needed."""
+    """Fails if a surface is requested."""
 
     progress = staticmethod(silent)
 
@@ -338,10 +338,10 @@ print(times[1] - times[0], times[2] - times[1])
 
 @pytest.mark.slow
 @pytest.mark.skipif(not (THREADS.parent / "schedstat").exists(), reason="how long each thread ran is not known here")
-def test_one_environment_is_read_by_one_thread(tmp_path):
-    """Some of torch's operations hand a few thousand numbers to a second thread and wait for it, which may be long in coming.
+def test_one_thread_reads_one_environment(tmp_path):
+    """Torch hands some operations on a few thousand numbers to a second thread and waits for it, possibly for long.
 
-    What is looked at is for how long other threads ran, not how long anything took.
+    The test measures how long other threads ran, not how long anything took.
     """
     (tmp_path / "scene.xml").write_text(
         "<mujoco><worldbody><body name='pad'><geom type='box' size='.05 .05 .01'/></body>"
@@ -358,5 +358,5 @@ def test_one_environment_is_read_by_one_thread(tmp_path):
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     reads, exponential = map(int, run.stdout.split())
-    assert exponential > 0  # a second thread there is
+    assert exponential > 0  # there is a second thread
     assert reads == 0

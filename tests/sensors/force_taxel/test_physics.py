@@ -11,7 +11,7 @@ ROUNDING = 1e-12
 
 
 @pytest.mark.parametrize("mass", [0.025, 0.25])
-def test_a_resting_cube_weighs_what_it_weighs(tmp_path, mass):
+def test_a_resting_cube_reads_its_weight(tmp_path, mass):
     touch = pad(tmp_path, mass=mass)
     readings = touch(settled(touch))
     np.testing.assert_allclose(readings["s"][0].sum(dim=0)[:2], [0, 0], atol=forces.AT_REST)
@@ -19,21 +19,21 @@ def test_a_resting_cube_weighs_what_it_weighs(tmp_path, mass):
     assert (readings["s"][0, :, 2] < 0).sum() >= 4
 
 
-def test_by_the_papers_law_two_cubes_weigh_the_same():
-    found = forces.weight((0.025, 0.25))
-    assert found.paper[0] == pytest.approx(found.paper[1], rel=0.05)
-    assert found.paper_error > 2
+def test_the_papers_law_gives_two_cubes_the_same_weight():
+    comparison = forces.weight((0.025, 0.25))
+    assert comparison.paper[0] == pytest.approx(comparison.paper[1], rel=0.05)
+    assert comparison.paper_error > 2
 
 
 @pytest.mark.parametrize("angle", [10.0, 25.0])
 def test_static_shear_without_sliding(angle):
-    """Gravity along the pad is held by friction: the taxels carry m g sin θ down the slope, though nothing moves."""
-    found = forces.static_shear(angle)
-    assert abs(found.paper[0]) < 0.2 * found.exact[0]
+    """Friction holds the cube on a slope: the taxels carry m g sin θ down the slope, though nothing moves."""
+    comparison = forces.static_shear(angle)
+    assert abs(comparison.paper[0]) < 0.2 * comparison.exact[0]
 
 
 @pytest.mark.parametrize("angle", [10.0, 25.0])
-def test_static_shear_is_the_solvers(tmp_path, angle):
+def test_static_shear_equals_the_solvers(tmp_path, angle):
     turn = Rotation.from_euler("y", angle, degrees=True)
     x, _, z = turn.apply([0, 0, 0.03])
     touch = pad(tmp_path, mount=f"euler='0 {angle} 0'", place=f"pos='{x} 0 {z}' euler='0 {angle} 0'")
@@ -43,14 +43,14 @@ def test_static_shear_is_the_solvers(tmp_path, angle):
 
 @pytest.mark.parametrize("motion", [(0.0, 1.0), (-1.0, 0.0)])
 def test_a_sliding_cube_drags_the_sensor_along_with_it(motion):
-    """μ N along the cube's motion, which gravity along the pad keeps up; no taxel's force leaves the cone of μ."""
-    found = forces.sliding(motion)
-    assert found.paper @ motion < 0
+    """μ N along the cube's motion, which gravity along the pad sustains; no taxel's force leaves the cone of μ."""
+    comparison = forces.sliding(motion)
+    assert comparison.paper @ motion < 0
 
 
 @pytest.mark.parametrize("place", forces.PLACES)
-def test_the_moment_is_the_solvers(tmp_path, place):
-    """A cube anywhere inside the pad: Σ x_j × f_j is the moment of its contacts, and the centre of pressure is below its centre."""
+def test_the_moment_equals_the_solvers(tmp_path, place):
+    """A cube anywhere on the pad: Σ x_j × f_j is the moment of its contacts, and the centre of pressure is below its centre."""
     x, y, angle = place
     touch = pad(tmp_path, place=f"pos='{x} {y} .03' euler='0 0 {angle}'", moment_iterations=12)
     state = settled(touch)
@@ -59,17 +59,17 @@ def test_the_moment_is_the_solvers(tmp_path, place):
     np.testing.assert_allclose(readings["s/residual"][0, 0].numpy(), moment - np.cross(pos, force).sum(axis=0), atol=ROUNDING)
     plain = pad(tmp_path, place=f"pos='{x} {y} .03' euler='0 0 {angle}'", moment_iterations=0)(state)["s"][0].numpy()
     centre = (force[:, 2, None] * pos[:, :2]).sum(axis=0) / force[:, 2].sum()
-    off = np.linalg.norm((plain[:, 2, None] * pos[:, :2]).sum(axis=0) / plain[:, 2].sum() - centre)
-    assert off > 1e-4 or place == (0, 0, 0)  # by depth and distance alone it would be elsewhere
+    offset = np.linalg.norm((plain[:, 2, None] * pos[:, :2]).sum(axis=0) / plain[:, 2].sum() - centre)
+    assert offset > 1e-4 or place == (0, 0, 0)  # by depth and distance alone it would be elsewhere
 
 
-def test_velocities_are_of_the_frames_origin():
-    found = forces.velocity_at_the_origin()
-    assert found.paper_error > 0.1
+def test_velocities_refer_to_the_frames_origin():
+    comparison = forces.velocity_at_the_origin()
+    assert comparison.paper_error > 0.1
 
 
 def test_a_single_row_cannot_hold_a_cube_upright(tmp_path):
-    """One row of taxels under one edge: the couple about the row is the residual, the force is whole where it is in reach."""
+    """One row of taxels under one edge: the couple about the row is the residual; the force within reach is complete."""
     row = [(x, -0.015, 0.01) for x in LINE]
     touch = pad(tmp_path, taxels=row, moment_iterations=12)
     state = settled(touch)
@@ -77,8 +77,8 @@ def test_a_single_row_cannot_hold_a_cube_upright(tmp_path):
     force = readings["s"][0].numpy()
     at = in_link(touch, state, state.contact_pos[0, 0].numpy() - state.body_pos[0, touch.inputs.bodies.index("pad")].numpy())
     load = in_link(touch, state, state.contact_force[0, 0].numpy())
-    apart = np.linalg.norm(at[:, None] - np.array(row), axis=2).min(axis=1)
-    near, far = apart < FOOTPRINT / 2, apart > FOOTPRINT
+    distance = np.linalg.norm(at[:, None] - np.array(row), axis=2).min(axis=1)
+    near, far = distance < FOOTPRINT / 2, distance > FOOTPRINT
     assert (near | far).all()
     assert near.any()
     assert far.any()

@@ -1,4 +1,4 @@
-"""What tests of noise build."""
+"""Fixtures of the noise tests."""
 
 import pytest
 import torch

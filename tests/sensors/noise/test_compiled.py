@@ -12,7 +12,7 @@ from tgdsl.testing.reference import full_scale_error
 def test_compiled_equals_eager(build):
     """At two numbers of environments: the second takes over the state of another module. No graph has numbers as inputs.
 
-    Knobs are ranges; those that are numbers are in the graph of all kinds, in `../test_compiled.py`.
+    Knobs are ranges; the graph of all kinds in `../test_compiled.py` has plain numbers.
     """
     sensors = {
         "r": {"noise": RANGES, "rate": 60, "history": {"length": 3, "reduce": "mean"}, "readout": "both"},
@@ -34,7 +34,7 @@ def agree_over_calls(compiled, eager, num_envs, calls):
         if call == 5:
             for touch in (eager, compiled):
                 touch.reset([1, 3])
-        (found,), (expected,) = (read(touch, range(call, call + 1), num_envs) for touch in (compiled, eager))
+        (result,), (expected,) = (read(touch, range(call, call + 1), num_envs) for touch in (compiled, eager))
         for name in expected:
-            a, b = (reading[name].flatten(0, -3) for reading in (found, expected))
+            a, b = (reading[name].flatten(0, -3) for reading in (result, expected))
             assert full_scale_error(a, b.double().numpy()).max() < FLOAT32_TOLERANCE, name

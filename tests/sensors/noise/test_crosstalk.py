@@ -1,4 +1,4 @@
-"""Crosstalk: any layout, and the sum is kept."""
+"""Crosstalk: any layout, and the sum is preserved."""
 
 import numpy as np
 import pytest
@@ -21,19 +21,19 @@ def test_crosstalk_stays_on_a_link_and_side_and_leaves_out_inactive_taxels(name,
     np.testing.assert_allclose(spread[is_inactive], alone[is_inactive], atol=1e-7)
     np.testing.assert_allclose(spread[:, is_inactive], alone[:, is_inactive], atol=1e-7)
     assert (spread.diagonal()[~is_inactive] < 0.99).all()
-    apart = layout.link_id[:, None] != layout.link_id
-    assert (spread[apart] == 0).all()
+    on_other_links = layout.link_id[:, None] != layout.link_id
+    assert (spread[on_other_links] == 0).all()
     assert (spread[layout.normal @ layout.normal.T <= 0] == 0).all()
 
 
-def test_the_papers_blur_loses_force_at_edges_and_ours_none():
-    """A kernel that is padded with zeros keeps about half at an edge and a quarter at a corner, a blur of χ = 1 throughout."""
-    found = filters.crosstalk_edges()
-    assert found.paper[1] < 0.62 and found.paper[2] < 0.37
+def test_the_papers_blur_loses_force_at_edges_and_ours_does_not():
+    """A zero-padded kernel keeps about half at an edge and a quarter at a corner, a blur of χ = 1 throughout."""
+    comparison = filters.crosstalk_edges()
+    assert comparison.paper[1] < 0.62 and comparison.paper[2] < 0.37
 
 
 def test_no_crosstalk_is_the_identity():
-    """A taxel whose strength is 0 gives nothing, but gets of what its neighbours give."""
+    """A taxel of strength 0 gives nothing, but receives from its neighbours."""
     none, signal = {"crosstalk": {"strength": 0.0, "sigma": "1 mm"}}, np.array([[1.0], [2.0], [3.0]])
     assert Noise(none, 3).lowered.terms == ()
     more = Noise([none, BLUR, {}], 3).read(signal)[0, :, 0].numpy() - signal[:, 0]
@@ -45,5 +45,5 @@ def test_no_crosstalk_is_the_identity():
 def test_crosstalk_keeps_channels_apart():
     signal = np.zeros((6, 3))
     signal[2, 1] = 1
-    found = Noise(BLUR, line(6), CHANNELS).read(signal)[0].numpy()
-    assert (found[:, [0, 2]] == 0).all() and (found[:, 1] > 0).all()
+    reading = Noise(BLUR, line(6), CHANNELS).read(signal)[0].numpy()
+    assert (reading[:, [0, 2]] == 0).all() and (reading[:, 1] > 0).all()

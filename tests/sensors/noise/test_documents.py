@@ -1,4 +1,4 @@
-"""What a document says of noise, and what the plan then holds: profiles, knobs by kind, links, quantities."""
+"""Noise in documents, and in the resulting plan: profiles, knobs by kind, links, quantities."""
 
 import numpy as np
 import pytest
@@ -19,15 +19,15 @@ NOISY = {
     ("proximity", "proximity"): {"white_noise": 1e-2, "drift": 1e-3, "quantization": 1e-2, "radius_noise": 6e-4, **DEAD, **TISSUE},
     ("elastomer", "elastomer"): {"white_noise": 1e-4, "drift": 1e-5, "quantization": 1e-4, "radius_noise": 3e-4, **DEAD, **TISSUE},
 }  # fmt: skip
-"""The paper's table "Sensor imperfection parameters", by sensor kind and observation type; what is not named is off."""
+"""The paper's table "Sensor imperfection parameters", by sensor kind and observation type; other knobs are off."""
 
 
 @pytest.mark.parametrize(("kind", "observation"), NOISY)
-def test_one_word_is_the_papers_noisy_condition(tmp_path, kind, observation):
-    """The plan holds the values of the table, the same for all channels, rows and environments, and no others."""
-    _, found = planned(tmp_path, kind, "noisy", observations=[observation])
-    assert {name: value.size for name, value in found.items()} == dict.fromkeys(NOISY[kind, observation], 1)
-    assert {name: value.item() for name, value in found.items()} == NOISY[kind, observation]
+def test_noisy_is_the_papers_noisy_condition(tmp_path, kind, observation):
+    """The plan holds exactly the table's values, the same for all channels, rows and environments."""
+    _, arrays = planned(tmp_path, kind, "noisy", observations=[observation])
+    assert {name: value.size for name, value in arrays.items()} == dict.fromkeys(NOISY[kind, observation], 1)
+    assert {name: value.item() for name, value in arrays.items()} == NOISY[kind, observation]
 
 
 BASE = {"read_delay", "jitter", "white_noise", "bias", "drift", "quantization"}
@@ -46,8 +46,8 @@ KNOBS_OF = {
     "microphone": set(),
 }
 """The paper's table "Imperfection knobs available per sensor type", the Schmitt threshold that its values give to `bool`, and
-the kinds that the paper has not: `force_taxel` like its taxels of force, `link_contact` and
-`temperature_grid` with what every sensor has, `contact_audio`, which reads blocks, with none."""
+kinds that the paper lacks: `force_taxel` like its taxels of force, `link_contact` and `temperature_grid` with the common
+knobs, and `contact_audio`, which reads blocks, with none."""
 VALUES = {
     "read_delay": 0.01,
     "jitter": 0.01,
@@ -64,7 +64,7 @@ VALUES = {
     "release_threshold": 1e-4,
 }
 IDLE = {("surface_distance", "radius_noise")}
-"""What the table gives a kind, and has no effect on what it reads: of that a warning says so."""
+"""Knobs that the table gives a kind but that do not affect its readings: a warning says so."""
 
 
 def test_the_tables_of_this_test_are_complete():
@@ -76,15 +76,15 @@ TERMS = {"read_delay": "delay", "jitter": "delay", "dead_probability": "dead", "
 
 
 @pytest.mark.parametrize("kind", KNOBS_OF)
-def test_the_knobs_that_a_kind_has(tmp_path, kind):
-    """All of them are planned, and nothing else."""
+def test_a_kind_plans_its_knobs(tmp_path, kind):
+    """All of them, and nothing else."""
     noise = {knob: VALUES[knob] for knob in sorted(KNOBS_OF[kind]) if (kind, knob) not in IDLE}
     terms, _ = planned(tmp_path, kind, noise)
     assert set(terms) == {TERMS.get(knob, knob) for knob in noise}
 
 
 @pytest.mark.parametrize(("kind", "knob"), [(kind, knob) for kind in KNOBS_OF for knob in VALUES if knob not in KNOBS_OF[kind]])
-def test_a_knob_that_a_kind_has_not(tmp_path, kind, knob):
+def test_a_knob_that_a_kind_lacks_is_a_mistake(tmp_path, kind, knob):
     assert mistakes(tmp_path, kind, {knob: VALUES[knob]}) == [f'sensors.s.noise.{knob}: "{kind}" has no knob "{knob}"']
 
 
@@ -102,15 +102,15 @@ def test_a_profile_without_knobs_for_a_kind_warns(tmp_path, kind, noise):
 
 
 @pytest.mark.parametrize("knob", ["crosstalk", "release_threshold"])
-def test_a_knob_that_a_kind_lacks_is_found_in_links_and_profiles(tmp_path, knob):
-    own = {knob: VALUES[knob]}
-    what = f'"contact_depth" has no knob "{knob}"'
-    assert mistakes(tmp_path, "contact_depth", {"links": {"palm": own}}) == [f"sensors.s.noise.links.palm.{knob}: {what}"]
-    assert mistakes(tmp_path, "contact_depth", "worn", {"worn": own}) == [
-        f"sensors.s.noise: {what} (in the profile worn → clean)"
+def test_a_missing_knob_is_named_in_links_and_profiles(tmp_path, knob):
+    knobs = {knob: VALUES[knob]}
+    message = f'"contact_depth" has no knob "{knob}"'
+    assert mistakes(tmp_path, "contact_depth", {"links": {"palm": knobs}}) == [f"sensors.s.noise.links.palm.{knob}: {message}"]
+    assert mistakes(tmp_path, "contact_depth", "worn", {"worn": knobs}) == [
+        f"sensors.s.noise: {message} (in the profile worn → clean)"
     ]
-    assert mistakes(tmp_path, "contact_depth", {"like": "old", "bias": 1}, {"worn": own, "old": {"like": "worn"}}) == [
-        f"sensors.s.noise: {what} (in the profile old → worn → clean)"
+    assert mistakes(tmp_path, "contact_depth", {"like": "old", "bias": 1}, {"worn": knobs, "old": {"like": "worn"}}) == [
+        f"sensors.s.noise: {message} (in the profile old → worn → clean)"
     ]
 
 
@@ -136,8 +136,8 @@ def rows(value) -> list[float]:
         ({"*": 2, "*_tip": 3, "b_tip": 0}, [3, 0, 2]),
     ],
 )
-def test_links_apart(tmp_path, links, expected):
-    """By name, group and wildcard; of several that match, the later one counts."""
+def test_links_override_knobs(tmp_path, links, expected):
+    """By name, group and wildcard; the last match counts."""
     noise = {"white_noise": 1, "links": {pattern: {"white_noise": value} for pattern, value in links.items()}}
     assert rows(planned(tmp_path, "contact_depth", noise)[1]["white_noise"]) == expected
     profiles = {"own": noise}
@@ -147,13 +147,13 @@ def test_links_apart(tmp_path, links, expected):
 
 def test_links_keep_the_other_knobs_and_can_switch_one_off(tmp_path):
     noise = {"like": "noisy", "links": {"palm": {"white_noise": 1, "hysteresis": None, "gain": [1, 1]}, "a_tip": {"bias": 2}}}
-    terms, found = planned(tmp_path, "contact_depth", noise)
+    terms, arrays = planned(tmp_path, "contact_depth", noise)
     assert terms == ("radius_noise", "gain", "hysteresis", "bias", "white_noise", "quantization", "dead")
-    assert rows(found["white_noise"]) == [2e-4, 2e-4, 1]
-    assert rows(found["hysteresis_strength"]) == [0.5, 0.5, 0]
-    assert rows(found["gain_low"]) == [0.85, 0.85, 1] and rows(found["gain_high"]) == [1.15, 1.15, 1]
-    assert rows(found["bias"]) == [2, 0, 0]
-    assert found["dead_probability"].item() == 0.05
+    assert rows(arrays["white_noise"]) == [2e-4, 2e-4, 1]
+    assert rows(arrays["hysteresis_strength"]) == [0.5, 0.5, 0]
+    assert rows(arrays["gain_low"]) == [0.85, 0.85, 1] and rows(arrays["gain_high"]) == [1.15, 1.15, 1]
+    assert rows(arrays["bias"]) == [2, 0, 0]
+    assert arrays["dead_probability"].item() == 0.05
 
 
 def test_links_of_a_sensor_that_reads_bodies(tmp_path):
@@ -162,32 +162,32 @@ def test_links_of_a_sensor_that_reads_bodies(tmp_path):
     np.testing.assert_array_equal(np.broadcast_to(bias, (1, 3)), [[1, 2, 1]])
 
 
-def test_links_of_a_profile_count_before_those_in_line(tmp_path):
+def test_links_in_line_override_those_in_a_profile(tmp_path):
     noise = {"like": "own", "links": {"*_tip": {"bias": 3}}}
-    found = planned(tmp_path, "contact_depth", noise, {"own": {"links": {"a_tip": {"bias": 1}, "palm": {"bias": 2}}}})[1]
-    assert rows(found["bias"]) == [3, 3, 2]
+    arrays = planned(tmp_path, "contact_depth", noise, {"own": {"links": {"a_tip": {"bias": 1}, "palm": {"bias": 2}}}})[1]
+    assert rows(arrays["bias"]) == [3, 3, 2]
 
 
-def test_unknown_links(tmp_path):
+def test_unknown_links_are_mistakes(tmp_path):
     for noise, profiles, place in (
         ({"links": {"a_tipp": {"bias": 1}}}, None, "sensors.s.noise.links.a_tipp: no link matches"),
         ("own", {"own": {"links": {"a_tipp": {"bias": 1}}}}, 'sensors.s.noise: in the profile "own": no link matches'),
     ):
-        (found,) = mistakes(tmp_path, "contact_depth", noise, profiles)
-        assert found.startswith(place) and '"a_tipp"' in found
+        (message,) = mistakes(tmp_path, "contact_depth", noise, profiles)
+        assert message.startswith(place) and '"a_tipp"' in message
 
 
-def test_links_that_a_sensor_is_not_on(tmp_path):
-    """In line that is a mistake; a profile may be shared by sensors on other links, and then says nothing of this one."""
+def test_links_without_the_sensor_are_a_mistake(tmp_path):
+    """In line only: a profile may be shared by sensors on other links, and ignores such links."""
     links = {"links": {"palm": {"bias": 1}}}
-    (found,) = mistakes(tmp_path, "contact_depth", links, links=["tips"])
-    assert found.startswith("sensors.s.noise.links.palm: no link matches")
+    (message,) = mistakes(tmp_path, "contact_depth", links, links=["tips"])
+    assert message.startswith("sensors.s.noise.links.palm: no link matches")
 
 
-def test_a_profile_with_links_that_a_sensor_is_not_on(tmp_path):
-    made = document(tmp_path, "contact_depth", "own", {"own": {"bias": 1, "links": {"palm": {"bias": 2}}}}, links="tips")
-    made["sensors"]["t"] = {**made["sensors"]["s"], "links": "palm"}
-    plan = compile_document(made).plan
+def test_a_profile_ignores_links_without_the_sensor(tmp_path):
+    spec = document(tmp_path, "contact_depth", "own", {"own": {"bias": 1, "links": {"palm": {"bias": 2}}}}, links="tips")
+    spec["sensors"]["t"] = {**spec["sensors"]["s"], "links": "palm"}
+    plan = compile_document(spec).plan
     assert [plan.arrays[f"sensors/{name}/noise/bias"].tolist() for name in ("s", "t")] == [[[1.0]], [[2.0]]]
 
 
@@ -203,13 +203,13 @@ def test_amplitudes_by_quantity(tmp_path):
         "dead_range": [{"force": -1}, {"force": 1, "torque": 0.1}],
         "quantization": 1e-2,
     }
-    found = planned(tmp_path, "kinematic_taxel", noise)[1]
-    np.testing.assert_array_equal(found["white_noise"], np.array([[5e-3] * 3 + [1e-4] * 3]).T)
-    np.testing.assert_array_equal(found["drift"], np.array([[0.0] * 3 + [1e-5] * 3]).T)
-    np.testing.assert_array_equal(found["bias"][..., 0], [[1, 1, 1, 0, 0, 0], [2, 2, 2, 0, 0, 0]])
-    np.testing.assert_array_equal(found["dead_low"], np.array([[-1.0] * 3 + [0.0] * 3]).T)
-    np.testing.assert_array_equal(found["dead_high"], np.array([[1.0] * 3 + [0.1] * 3]).T)
-    assert found["quantization"].tolist() == [[1e-2]]
+    arrays = planned(tmp_path, "kinematic_taxel", noise)[1]
+    np.testing.assert_array_equal(arrays["white_noise"], np.array([[5e-3] * 3 + [1e-4] * 3]).T)
+    np.testing.assert_array_equal(arrays["drift"], np.array([[0.0] * 3 + [1e-5] * 3]).T)
+    np.testing.assert_array_equal(arrays["bias"][..., 0], [[1, 1, 1, 0, 0, 0], [2, 2, 2, 0, 0, 0]])
+    np.testing.assert_array_equal(arrays["dead_low"], np.array([[-1.0] * 3 + [0.0] * 3]).T)
+    np.testing.assert_array_equal(arrays["dead_high"], np.array([[1.0] * 3 + [0.1] * 3]).T)
+    assert arrays["quantization"].tolist() == [[1e-2]]
 
 
 @pytest.mark.parametrize(
@@ -226,40 +226,40 @@ def test_amplitudes_by_quantity(tmp_path):
 )
 def test_the_quantities_of_each_kind(tmp_path, kind, quantities):
     amplitudes = ("bias", "white_noise", "drift", "quantization")
-    found = planned(tmp_path, kind, {knob: dict.fromkeys(quantities, 0.5) for knob in amplitudes})[1]
-    assert {name: value.tolist() for name, value in found.items()} == {knob: [[0.5]] for knob in amplitudes}
-    (what,) = mistakes(tmp_path, kind, {"drift": {"temperature": 1}})
-    assert what == 'sensors.s.noise: "drift" names "temperature", which this sensor does not read'
+    arrays = planned(tmp_path, kind, {knob: dict.fromkeys(quantities, 0.5) for knob in amplitudes})[1]
+    assert {name: value.tolist() for name, value in arrays.items()} == {knob: [[0.5]] for knob in amplitudes}
+    (message,) = mistakes(tmp_path, kind, {"drift": {"temperature": 1}})
+    assert message == 'sensors.s.noise: "drift" names "temperature", which this sensor does not read'
 
 
-def test_a_quantity_that_outputs_leave_out(tmp_path):
-    (what,) = mistakes(tmp_path, "kinematic_taxel", {"bias": {"torque": 1}}, outputs=["force"])
-    assert what == 'sensors.s.noise: "bias" names "torque", which this sensor does not read'
+def test_a_quantity_that_outputs_omit_is_a_mistake(tmp_path):
+    (message,) = mistakes(tmp_path, "kinematic_taxel", {"bias": {"torque": 1}}, outputs=["force"])
+    assert message == 'sensors.s.noise: "bias" names "torque", which this sensor does not read'
 
 
 # profiles
 
 
-def test_profiles_upon_profiles(tmp_path):
+def test_profiles_build_on_profiles(tmp_path):
     profiles = {
         "worn": {"like": "noisy", "bias": 1e-3, "gain": [0.5, 1]},
         "old": {"like": "worn", "gain": [0.4, 1], "links": {"palm": {"bias": 2e-3}}},
     }
-    _, found = planned(tmp_path, "contact_depth", {"like": "old", "hysteresis": None, "read_delay": "5 ms"}, profiles)
-    assert rows(found["bias"]) == [1e-3, 1e-3, 2e-3]
-    assert found["gain_low"].item() == 0.4 and found["gain_high"].item() == 1
-    assert found["read_delay"].item() == 5e-3 and "hysteresis_strength" not in found
+    _, arrays = planned(tmp_path, "contact_depth", {"like": "old", "hysteresis": None, "read_delay": "5 ms"}, profiles)
+    assert rows(arrays["bias"]) == [1e-3, 1e-3, 2e-3]
+    assert arrays["gain_low"].item() == 0.4 and arrays["gain_high"].item() == 1
+    assert arrays["read_delay"].item() == 5e-3 and "hysteresis_strength" not in arrays
     rest = {name: NOISY["contact_depth", "depth"][name] for name in ("white_noise", "quantization", "radius_noise", *DEAD)}
-    assert {name: found[name].item() for name in rest} == rest
+    assert {name: arrays[name].item() for name in rest} == rest
 
 
-def test_a_profile_upon_noisy_is_of_each_kind(tmp_path):
-    """`like: noisy` in a profile means what `noisy` means for the sensor that uses it."""
+def test_a_profile_like_noisy_depends_on_the_kind(tmp_path):
+    """In a profile `like: noisy` means the `noisy` of the sensor that uses it."""
     for kind, expected in (("contact_depth", 2e-4), ("elastomer", 1e-4), ("proximity", 1e-2)):
-        found = planned(tmp_path, kind, "mine", {"mine": {"like": "noisy", "bias": 1}})[1]
-        assert found["white_noise"].item() == expected and found["bias"].item() == 1
+        arrays = planned(tmp_path, kind, "mine", {"mine": {"like": "noisy", "bias": 1}})[1]
+        assert arrays["white_noise"].item() == expected and arrays["bias"].item() == 1
 
 
-def test_a_document_may_have_its_own_noisy(tmp_path):
+def test_a_document_may_define_noisy(tmp_path):
     assert planned(tmp_path, "contact_depth", "noisy", {"noisy": {"bias": 1}})[1] == {"bias": np.array([[1.0]])}
     assert planned(tmp_path, "contact_depth", {"like": "noisy", "drift": 2}, {"noisy": {"bias": 1}})[0] == ("bias", "drift")

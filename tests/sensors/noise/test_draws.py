@@ -1,4 +1,4 @@
-"""What random numbers depend on: seed, environment and call, and nothing else."""
+"""Random numbers depend on seed, environment and call, and on nothing else."""
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ from tgdsl.testing.reference import full_scale_error
 
 
 def test_another_sensor_changes_no_noise(build):
-    """Neither one before it nor one behind it, on the same taxels or on others."""
+    """Neither before it nor after it, on the same taxels or on others."""
     first = {"noise": EVERY_KNOB, "rate": 60}
     alone = read(build(first=first), range(5))
     contact = {"kind": "contact", "noise": CONTACT_NOISE}
@@ -18,8 +18,8 @@ def test_another_sensor_changes_no_noise(build):
         {"second": first, "third": contact, "first": first},
         {"third": {**contact, "links": "tip"}, "first": first},
     ):
-        found = read(build(**sensors), range(5))
-        assert_same([{"first": readings["first"]} for readings in found], alone)
+        results = read(build(**sensors), range(5))
+        assert_same([{"first": readings["first"]} for readings in results], alone)
     both = read(build(first=first, second=first), range(5))
     assert not any(torch.equal(readings["first"], readings["second"]) for readings in both)
 
@@ -31,7 +31,7 @@ def test_more_environments_change_no_noise(build):
 
 
 @pytest.mark.parametrize("seed", [0, 12345, -7, 2**40])
-def test_a_split_batch_is_the_whole_one(build, seed):
+def test_a_split_batch_equals_the_whole(build, seed):
     sensors = {"s": {"noise": RANGES, "rate": 60}, "c": {"kind": "contact", "noise": CONTACT_NOISE}}
     whole = read(build(**sensors).seed(seed), range(6))
     for first in (0, 4):
@@ -49,7 +49,7 @@ def test_other_seeds_and_environments_give_other_noise(build):
                 assert (a != b).float().mean() > 0.99
 
 
-def test_a_seed_counts_from_the_start_again(build):
+def test_seeding_restarts_the_count(build):
     touch = build(s={"noise": RANGES})
     first = read(touch.seed(5), range(4))
     read(touch, range(4, 7))
@@ -58,17 +58,17 @@ def test_a_seed_counts_from_the_start_again(build):
 
 @pytest.mark.slow
 def test_the_second_process_has_the_second_half(tmp_path):
-    """Two processes of a distributed run, of 4 environments each, read what one of 8 reads, without being told who they are."""
-    made = document(tmp_path, {"s": {"noise": RANGES}})
-    torch.multiprocessing.spawn(read_of_rank, (str(tmp_path / "store"), made, str(tmp_path)), nprocs=2)
-    whole = read(tgdsl.compile(made, dtype=torch.float64), range(4))
+    """Two processes of a distributed run, of 4 environments each, read what one of 8 reads; nobody passes their ranks."""
+    spec = document(tmp_path, {"s": {"noise": RANGES}})
+    torch.multiprocessing.spawn(read_of_rank, (str(tmp_path / "store"), spec, str(tmp_path)), nprocs=2)
+    whole = read(tgdsl.compile(spec, dtype=torch.float64), range(4))
     for rank in (0, 1):
         part = slice(4 * rank, 4 * rank + 4)
         assert_same(torch.load(tmp_path / f"{rank}.pt"), whole, part)
 
 
 @pytest.mark.parametrize("noise", [EVERY_KNOB, RANGES])
-def test_float32_draws_what_float64_draws(build, noise):
+def test_float32_draws_the_same_as_float64(build, noise):
     exact, rounded = build(s={"noise": noise}), build(torch.float32, s={"noise": noise})
     for a, b in zip(read(rounded, range(8)), read(exact, range(8)), strict=True):
         assert a["s"].dtype == torch.float32
@@ -76,7 +76,7 @@ def test_float32_draws_what_float64_draws(build, noise):
 
 
 def test_everything_stays_on_its_device(build):
-    """On a device that holds no numbers: no stage makes a tensor on the CPU that it then mixes with the module's."""
+    """On the meta device: no stage mixes a CPU tensor with the module's."""
     touch = build(torch.float32, s={"noise": RANGES, "rate": 60}, c={"kind": "contact", "noise": CONTACT_NOISE})
     state = touch.example_state(4)
     memory = touch.memory.tensors(4, state.dt, touch.dtype, touch.device)
