@@ -1,4 +1,4 @@
-"""Fields of a state from arrays of any engine: contacts against a loop over them, velocities against MuJoCo's own."""
+"""Fields of a state from arrays of any engine: contacts against a loop over them, velocities against MuJoCo's."""
 
 import re
 from typing import Any
@@ -18,7 +18,7 @@ FIELDS = ("contact_found", "contact_pos", "contact_normal", "contact_force", "co
 INPUTS = Inputs(
     fields=FIELDS,
     bodies=("palm", "tip", "box"),
-    # A link that is an object too, one object by two names, an object with a body below, and one that is a single geom.
+    # A link that is also an object, an object with two names, one with a child body, and one that is a single geom.
     pairs=(Pair("palm", "box"), Pair("palm", "same"), Pair("tip", "box"), Pair("tip", "palm"), Pair("palm", "knob")),
     bodies_of={"box": "box", "same": "box", "palm": "palm", "knob": "box"},
     slots=2,
@@ -40,38 +40,38 @@ LINKS = {"palm": {1}, "tip": {2}}
 def random_contacts(num, num_envs, seed=0) -> dict[str, Any]:
     rng = torch.Generator().manual_seed(seed)
     vectors = {name: torch.randn(num, 3, generator=rng, dtype=torch.float64) for name in ("pos", "normal", "force", "torque")}
-    vectors["force"][::5] = 0.0  # these are none
+    vectors["force"][::5] = 0.0  # no contacts
     pairs = torch.randint(-1, 5, (num, 2), generator=rng)
     return {"pairs": pairs, **vectors, "env": torch.randint(num_envs, (num,), generator=rng)}
 
 
 def by_loop(contacts, num_envs, force_on) -> dict[str, np.ndarray]:
-    """Return the fields as their definitions say, contact by contact."""
+    """Return the fields by their definitions, contact by contact."""
     fields = {name: np.zeros((num_envs, 5, 2, 3)) for name in FIELDS}
     fields |= {"contact_found": np.zeros((num_envs, 5)), "contact_netforce": np.zeros((num_envs, 5, 3))}
     values = {name: value.numpy() for name, value in contacts.items()}
-    for i, (one, other) in enumerate(values["pairs"]):
+    for i, (first, second) in enumerate(values["pairs"]):
         if not values["force"][i].any():
             continue
         for p, pair in enumerate(INPUTS.pairs):
-            for target, link, sign in ((one, other, 1.0), (other, one, -1.0)):
+            for target, link, sign in ((first, second, 1.0), (second, first, -1.0)):
                 if target not in OBJECTS[pair.object] or link not in LINKS[pair.link]:
                     continue
                 env = values["env"][i]
-                acting = sign if force_on == 2 else -sign
+                force_sign = sign if force_on == 2 else -sign
                 slot = int(fields["contact_found"][env, p])
                 fields["contact_found"][env, p] += 1
-                fields["contact_netforce"][env, p] += acting * values["force"][i]
+                fields["contact_netforce"][env, p] += force_sign * values["force"][i]
                 if slot < 2:
                     fields["contact_pos"][env, p, slot] = values["pos"][i]
                     fields["contact_normal"][env, p, slot] = sign * values["normal"][i]
-                    fields["contact_force"][env, p, slot] = acting * values["force"][i]
-                    fields["contact_torque"][env, p, slot] = acting * values["torque"][i]
+                    fields["contact_force"][env, p, slot] = force_sign * values["force"][i]
+                    fields["contact_torque"][env, p, slot] = force_sign * values["torque"][i]
     return fields
 
 
 @pytest.mark.parametrize("force_on", [1, 2])
-def test_contacts_are_put_where_a_loop_puts_them(force_on):
+def test_contacts_by_pair_agrees_with_a_loop(force_on):
     contacts = random_contacts(200, 3)
     fields = tgdsl.contacts_by_pair(INPUTS, GEOMS, **contacts, num_envs=3, force_on=force_on)
     expected = by_loop(contacts, 3, force_on)
@@ -86,7 +86,7 @@ def test_no_contacts_leave_all_slots_empty():
     assert not any(value.any() for value in fields.values())
 
 
-def test_rows_that_are_contacts_may_be_given():
+def test_is_contact_selects_rows():
     contacts = random_contacts(50, 1)
     chosen = torch.arange(50) % 3 == 0
     some = {name: value[chosen] for name, value in contacts.items()}
@@ -96,7 +96,7 @@ def test_rows_that_are_contacts_may_be_given():
     assert all(torch.equal(fields[name], expected[name]) for name in FIELDS)
 
 
-def test_geoms_that_cannot_be_looked_up_are_refused():
+def test_missing_or_ambiguous_geoms_are_refused():
     contacts = random_contacts(1, 1)
     for geoms, message in (
         (
@@ -110,7 +110,7 @@ def test_geoms_that_cannot_be_looked_up_are_refused():
             tgdsl.contacts_by_pair(INPUTS, geoms, **contacts)
 
 
-def test_velocities_of_centres_of_mass_are_taken_to_the_origin(tmp_path):
+def test_velocities_of_centres_of_mass_are_moved_to_the_origin(tmp_path):
     touch = module(tmp_path)
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
     data = mujoco.MjData(model)
@@ -133,7 +133,7 @@ def test_velocities_of_centres_of_mass_are_taken_to_the_origin(tmp_path):
         np.testing.assert_allclose(value, getattr(expected, name), atol=1e-12, err_msg=name)
 
 
-def test_a_world_that_an_engine_does_not_list_is_at_rest():
+def test_an_unlisted_world_body_is_at_rest():
     inputs = Inputs(("body_pos", "body_quat", "body_linvel", "body_angvel"), ("box", "world"), (), {}, 0)
     ones = torch.ones(2, 1, 3)
     fields = tgdsl.bodies_by_name(inputs, ["box"], ones, torch.tensor([0.0, 1.0, 0.0, 0.0]).expand(2, 1, 4), ones, ones)

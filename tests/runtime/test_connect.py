@@ -1,4 +1,4 @@
-"""One way to step and observe: a simulation, the same scene behind the hand's serial protocol, and what is refused."""
+"""One interface to step and observe: a simulation, the same scene behind the hand's serial protocol, and errors."""
 
 from pathlib import Path
 
@@ -27,31 +27,31 @@ def touch(tmp_path_factory) -> TactileModule:
     return tgdsl.compile(document(tmp_path_factory.mktemp("hand"), {"policy": TERMS, "blind": [{"type": "none"}]}))
 
 
-def recorded(env: Connection, controls) -> torch.Tensor:
-    found = [env.observe()["policy"]]
+def record_policy(env: Connection, controls) -> torch.Tensor:
+    observations = [env.observe()["policy"]]
     for control in controls:
         env.step(control)
-        found.append(env.observe()["policy"])
-    return torch.cat(found).double()
+        observations.append(env.observe()["policy"])
+    return torch.cat(observations).double()
 
 
 def half_counts(axes: str) -> torch.Tensor:
-    """Return half a count of each fingertip along the axes of its link, flattened as `agg_force` is."""
+    """Return half a count of each fingertip along its link's axes, flattened like `agg_force`."""
     along_link = 0.5 * np.einsum("ij,fj->fi", abs(TURN), SCALE)
     return torch.from_numpy(along_link[:, ["xyz".index(axis) for axis in axes]].T.reshape(-1))
 
 
 @pytest.mark.slow
 def test_emulator_and_simulation_agree_within_half_a_count(touch):
-    """Fingers press, are released by a reset, and press again; then nothing but rounding lies between both."""
+    """Fingers press, are released by a reset, and press again; only rounding differs."""
     controls = ramp(30)
     runs = []
     for source in ("simulation", "emulator"):
         with tgdsl.connect(touch, source, calibration=NEWTON, motion=instant(touch), lockstep=True) as env:
             assert (env.num_envs, env.control_step) == (1, 0.02)
-            first = recorded(env, controls)
+            first = record_policy(env, controls)
             env.reset()
-            runs.append(torch.cat([first, recorded(env, controls[:20])]))
+            runs.append(torch.cat([first, record_policy(env, controls[:20])]))
     simulated, emulated = runs
     pressed = (simulated[:, :15].reshape(-1, 3, 5) != 0).any(dim=1).any(dim=0)
     assert pressed.sum() >= 2
@@ -76,36 +76,36 @@ def test_the_real_hands_scene_agrees_too():
     for source in ("simulation", "emulator"):
         options = {"keyframe": "rest", "calibration": calibration, "motion": motion, "lockstep": True}
         with tgdsl.connect(touch, source, **options) as env:
-            runs.append(recorded(env, controls).reshape(-1, 3, 5))
+            runs.append(record_policy(env, controls).reshape(-1, 3, 5))
     simulated, emulated = runs
     assert (simulated[-1].norm(dim=0) > 1).sum() >= 2
     assert ((simulated - emulated).abs() <= 0.5 * torch.from_numpy(scale.T) * (1 + 1e-4)).all()
 
 
-def test_the_simulation_is_what_the_module_observes(touch):
+def test_a_simulation_gives_the_modules_observations(touch):
     with tgdsl.connect(touch, num_envs=3, control_step=0.01) as env:
         sim = tgdsl.simulate(touch, 3, substeps=5)
         assert env.num_envs == 3
         for control in ramp(10):
             env.step(control)
             sim.step(control)
-            found, expected = env.observe(), touch.observe(touch(sim.state()))
-            assert found.keys() == expected.keys() == {"policy", "blind"}
-            for group, part in found.items():
+            observations, expected = env.observe(), touch.observe(touch(sim.state()))
+            assert observations.keys() == expected.keys() == {"policy", "blind"}
+            for group, part in observations.items():
                 torch.testing.assert_close(part, expected[group], rtol=0, atol=0)
 
 
-def test_a_reading_is_made_once_per_step(tmp_path):
+def test_observe_reads_once_per_step(tmp_path):
     stacked = tgdsl.compile(document(tmp_path, {"policy": TERMS[:1]}, depth={"history": 2}))
     with tgdsl.connect(stacked) as env:
         for control in ramp(8):
             env.step(control)
-            found = [env.observe()["policy"] for _ in range(3)]
-            assert all((part == found[0]).all() for part in found)
-        assert (found[0][:, :15] != found[0][:, 15:]).any()
+            observations = [env.observe()["policy"] for _ in range(3)]
+            assert all((part == observations[0]).all() for part in observations)
+        assert (observations[0][:, :15] != observations[0][:, 15:]).any()
 
 
-def test_what_a_hand_cannot_give_is_said_before_it_is_touched(tmp_path):
+def test_unavailable_observations_are_refused_before_a_hand_is_opened(tmp_path):
     touch = tgdsl.compile(document(tmp_path, {"policy": [{"type": "depth", "of": "depth"}]}))
     for source in ("xhand1:/dev/no-such-port", "emulator"):
         with pytest.raises(ObservationError, match=r"an XHand1 cannot give these observations:\n  policy\[0\] depth of depth"):
@@ -124,19 +124,19 @@ def test_what_a_hand_cannot_give_is_said_before_it_is_touched(tmp_path):
         ("emulator", {"keyframe": "none"}, SimulationError, 'the scene has no keyframe "none"'),
     ],
 )
-def test_what_cannot_be_connected(touch, source, options, error, message):
+def test_invalid_sources_and_options_are_refused(touch, source, options, error, message):
     with pytest.raises(error, match=message):
         tgdsl.connect(touch, source, **options)
 
 
-def test_only_the_environment_that_there_is_can_be_reset(tmp_path):
+def test_reset_of_a_hand_accepts_only_its_environment(tmp_path):
     touch = tgdsl.compile(document(tmp_path, {"policy": TERMS[:1]}, depth={"history": 3}))
     with tgdsl.connect(touch, "emulator", calibration=NEWTON, motion=instant(touch), lockstep=True) as env:
         for control in ramp(10):
             env.step(control)
         pressed = env.observe()["policy"]
-        for nobody in ([], [False], torch.zeros(1, dtype=torch.bool)):
-            env.reset(nobody)
+        for env_ids in ([], [False], torch.zeros(1, dtype=torch.bool)):
+            env.reset(env_ids)
             assert (env.observe()["policy"] == pressed).all()
         with pytest.raises(HandError, match=r"env_ids: found 3, expected indices from 0 to 0, or a mask of 1"):
             env.reset([3])

@@ -1,4 +1,4 @@
-"""Connections to the emulator: in real time and in lockstep, and how it ends."""
+"""Connections to the emulator: in real time, in lockstep, and after it ends."""
 
 import re
 import time
@@ -26,7 +26,7 @@ def touch(tmp_path_factory) -> TactileModule:
 
 
 def test_the_emulator_runs_in_real_time(touch):
-    """It presses, says so, and lets go when it is reset."""
+    """The hand presses, reads forces, and releases at a reset."""
     with tgdsl.connect(touch, "emulator", calibration=NEWTON, motion=instant(touch)) as env:
         unloaded = env.observe()["policy"]
         assert wait_until(lambda: stepped(env, SQUEEZE) and env.observe()["policy"].abs().max() > 10)
@@ -35,7 +35,7 @@ def test_the_emulator_runs_in_real_time(touch):
 
 
 @pytest.mark.slow
-def test_a_passive_body_holds_where_it_is(touch):
+def test_a_passive_hand_holds_its_position(touch):
     with tgdsl.connect(touch, "emulator", calibration=NEWTON, motion=instant(touch), lockstep=True) as env:
         assert isinstance(env.source, EmulatedSource)
         for control in ramp(10):
@@ -46,29 +46,29 @@ def test_a_passive_body_holds_where_it_is(touch):
         assert wait_until(lambda: hand.is_passive)
         for _ in range(30):
             env.step()
-        held = env.source.sample().joint_pos
+        position = env.source.sample().joint_pos
         env.step()
-        assert env.source.sample().joint_pos[0].numpy() == pytest.approx(held[0].numpy(), abs=1e-5)
+        assert env.source.sample().joint_pos[0].numpy() == pytest.approx(position[0].numpy(), abs=1e-5)
         assert env.source.sample().joint_vel.abs().max() < 1e-2
-        assert held.abs().max() > 0.01
+        assert position.abs().max() > 0.01
 
 
-def test_what_bytes_cannot_hold_is_said_once_and_flagged(touch):
+def test_forces_beyond_a_byte_are_warned_of_once_and_flagged(touch):
     tiny = Calibration("N", SCALE / 100, NEWTON.rotation, NEWTON.bias, NEWTON.tare)
     with tgdsl.connect(touch, "emulator", calibration=tiny, motion=instant(touch), lockstep=True) as env:
-        with warnings.catch_warnings(record=True) as said:
+        with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             for control in ramp(20):
                 env.step(control)
-        assert len(said) == 1
-        assert re.match(r"the emulated (\w+, )*\w+ felt more than counts of -128…127", str(said[0].message))
+        assert len(caught) == 1
+        assert re.match(r"the emulated (\w+, )*\w+ felt more than counts of -128…127", str(caught[0].message))
         assert isinstance(env.source, EmulatedSource)
         sample = env.source.sample()
         assert sample.is_tip_saturated.any()
         assert (sample.reading.state.total_force <= FORCE_MAX).all()
 
 
-def test_a_simulation_that_ends_is_an_error_and_no_old_reading(touch, monkeypatch):
+def test_a_step_raises_when_the_simulation_has_ended(touch, monkeypatch):
     with tgdsl.connect(touch, "emulator", calibration=NEWTON) as env:
         assert isinstance(env.source, EmulatedSource)
         env.step()
@@ -83,7 +83,7 @@ def test_a_simulation_that_ends_is_an_error_and_no_old_reading(touch, monkeypatc
             env.step()
 
 
-def test_a_reset_does_not_hide_that_the_simulation_ended(touch, monkeypatch):
+def test_a_reset_raises_when_the_simulation_has_ended(touch, monkeypatch):
     with tgdsl.connect(touch, "emulator", calibration=NEWTON) as env:
         assert isinstance(env.source, EmulatedSource)
         body = env.source.body
@@ -99,8 +99,8 @@ def test_a_reset_does_not_hide_that_the_simulation_ended(touch, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lockstep", [True, False])
-def test_an_emulator_that_ends_is_told_to_who_waits_for_it(touch, monkeypatch, lockstep):
-    """A mistake in what the fingertips feel ends its thread: the step that waits for a reading says so, and so does close."""
+def test_step_reset_and_close_raise_when_the_emulator_has_ended(touch, monkeypatch, lockstep):
+    """A bug in the fingertips' forces ends the emulator's thread."""
     timing = SerialTiming(reply_timeout_s=1.0, silence_s=0.5)
     env = tgdsl.connect(touch, "emulator", calibration=NEWTON, timing=timing, lockstep=lockstep)
     assert isinstance(env.source, EmulatedSource)
@@ -120,22 +120,22 @@ def test_an_emulator_that_ends_is_told_to_who_waits_for_it(touch, monkeypatch, l
 
 
 @pytest.mark.slow
-def test_in_lockstep_a_policy_may_think_for_as_long_as_it_likes(touch):
-    """The watchdog's time passes on the wall, where nothing runs: what is observed does not know of it."""
+def test_in_lockstep_a_policy_may_take_any_time(touch):
+    """Pauses beyond the watchdog's time do not change observations."""
     model, runs = tgdsl.simulate(touch, 1).model, []
     for watchdog_s, pause in ((1.0, 0.0), (0.025, 0.06)):
         motion = MotionLimits.of_robot(model, speed=1e9, current_limit=300, kp=100, watchdog_s=watchdog_s)
         with tgdsl.connect(touch, "emulator", calibration=NEWTON, motion=motion, lockstep=True) as env:
-            found = []
+            observations = []
             for control in [*ramp(10), None]:
                 env.step(control)
                 time.sleep(pause)
-                found.append(env.observe()["policy"])
-        runs.append(torch.cat(found))
+                observations.append(env.observe()["policy"])
+        runs.append(torch.cat(observations))
     assert (runs[0] == runs[1]).all() and runs[0].any()
 
 
-def test_the_emulator_feels_what_is_observed_and_nothing_else(tmp_path):
+def test_the_emulator_needs_one_force_per_fingertip(tmp_path):
     blind = tgdsl.compile(document(tmp_path, {"policy": [{"type": "agg_bool", "of": "contact"}]}))
     message = r"policy\[0\] agg_bool of contact: the emulator's thumb, index, middle, ring, pinky would feel nothing"
     with pytest.raises(ObservationError, match=message):

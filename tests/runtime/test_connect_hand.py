@@ -1,4 +1,4 @@
-"""Connections to a hand, an emulated device behind its serial port: its actuators, its port, what is sent to it."""
+"""Connections to a hand, an emulated device behind a serial port: actuators, ports, and bytes sent."""
 
 import re
 import warnings
@@ -43,8 +43,8 @@ def test_actuators_may_be_in_any_order():
     assert [model.joint(i).name for i in joint_ids(model)] == [f"left_hand_{name}" for name in JOINTS]
     controls = JointControls.of_model(model)
     angles = dict(zip(order, np.linspace(-1, 1, 12), strict=True))
-    for given in (np.array([angles[name] for name in order]), np.array([[angles[name] for name in order]])):
-        assert controls.targets(given).tolist() == [angles[name] for name in JOINTS]
+    for control in (np.array([angles[name] for name in order]), np.array([[angles[name] for name in order]])):
+        assert controls.targets(control).tolist() == [angles[name] for name in JOINTS]
     with pytest.raises(MotionError, match=re.escape("control has shape (11,), expected (1, 12) or (12,)")):
         controls.targets(np.zeros(11))
 
@@ -62,20 +62,20 @@ def test_actuators_may_be_in_any_order():
          "the actuators arm are not of the hand's joints"),
     ],
 )  # fmt: skip
-def test_actuators_that_are_not_a_hands(xml, message):
+def test_actuators_that_do_not_fit_a_hand_are_refused(xml, message):
     with pytest.raises(MotionError, match=message):
         JointControls.of_model(mujoco.MjModel.from_xml_string(xml))
 
 
-def test_limits_beyond_the_robot_files_are_refused(touch):
+def test_limits_beyond_the_robots_ranges_are_refused(touch):
     wide = MotionLimits((-1.1,) * 12, (1.0,) * 12, (1.0,) * 12, (300,) * 12, kp=100)
     for source in ("emulator", "xhand1:/dev/no-such-port"):
         with pytest.raises(MotionError, match=r"thumb_bend_joint: limits from -1.1 to 1 rad, expected them within .* -1 to 1"):
             tgdsl.connect(touch, source, motion=wide)
 
 
-def test_reading_alone_moves_nothing_and_says_once_that_controls_go_nowhere(touch, monkeypatch):
-    """Every byte that is written to the port of a hand that is connected, stepped with controls, reset and closed."""
+def test_a_read_only_hand_does_not_move_and_warns_once_about_controls(touch, monkeypatch):
+    """Checks every byte written while the hand is connected, stepped with controls, reset and closed."""
     written = WrittenBytes()
     plain_open = XHand1.open
     monkeypatch.setattr(XHand1, "open", lambda *args, **options: plain_open(*args, **options, open_port=written.open))
@@ -97,7 +97,7 @@ def test_reading_alone_moves_nothing_and_says_once_that_controls_go_nowhere(touc
 
 
 @pytest.mark.slow
-def test_after_a_failed_step_nothing_old_is_observed(touch):
+def test_observe_raises_after_a_failed_step(touch):
     timing = SerialTiming(reply_timeout_s=2.0, silence_s=1.0)
     with FaultyEmulator() as emulator, tgdsl.connect(touch, f"xhand1:{emulator.device}", timing=timing) as env:
         env.observe()
@@ -117,7 +117,7 @@ def test_after_a_failed_step_nothing_old_is_observed(touch):
         assert (env.observe()["policy"] == 0).all()
 
 
-def test_a_hand_goes_where_the_actuators_say(tmp_path):
+def test_controls_reach_joints_in_the_actuators_order(tmp_path):
     order = JOINTS[::-1]
     touch = tgdsl.compile(document(tmp_path, {"policy": TERMS}, hand_xml(actuators=order)))
     with (
@@ -142,7 +142,7 @@ def test_a_hand_goes_where_the_actuators_say(tmp_path):
     ("ports", "found"),
     [((), "none"), (("/dev/ttyS0",), "none"), (("/dev/ttyUSB0", "/dev/ttyACM1"), "/dev/ttyUSB0, /dev/ttyACM1")],
 )
-def test_the_only_port_is_taken(touch, monkeypatch, ports, found):
+def test_the_only_port_is_chosen(touch, monkeypatch, ports, found):
     infos = tuple(PortInfo(port, "", "") for port in ports)
     monkeypatch.setattr(connecting, "list_ports", lambda: infos)
     with pytest.raises(HandError, match=f"expected one USB serial port, found {found}; name the hand's"):

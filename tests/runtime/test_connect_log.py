@@ -1,4 +1,4 @@
-"""The example's script on the simulation, on the emulator, and on a log that was recorded of the emulator."""
+"""The example script on the simulation, on the emulator, and on a log recorded from the emulator."""
 
 import math
 import runpy
@@ -34,7 +34,7 @@ def touch(script):
 
 
 def test_one_script_on_simulation_emulator_and_log(script, touch, tmp_path):
-    """Emulator and simulation agree within rounding, the log and the emulator to the bit."""
+    """Emulator and simulation agree within rounding, log and emulator exactly."""
     model = scene_model(touch.plan.scene)
     motion = MotionLimits.of_robot(model, speed=1e9, current_limit=300, kp=100, watchdog_s=1.0)
     controls = [np.float32(control) for control in script["squeeze"](model, STEPS)]
@@ -52,13 +52,13 @@ def test_one_script_on_simulation_emulator_and_log(script, touch, tmp_path):
     emulated = torch.cat(emulated)
     assert (simulated[-1].reshape(3, 5).norm(dim=0) > 1).sum() >= 2
     assert ((emulated - simulated).abs() <= 0.05 * (1 + 1e-4)).all()
-    step = 1e-6 * math.floor(1e6 * min(np.diff(starts)))  # so short that no step passes over a reading
+    step = 1e-6 * math.floor(1e6 * min(np.diff(starts)))  # short enough that no step skips a reading
     with tgdsl.connect(touch, log, control_step=step, lockstep=True) as env:
         replayed = [env.observe()["policy"]]
         while not env.is_over:
             try:
                 env.step(controls[0])
-            except HandError:  # where the recording itself was held up
+            except HandError:  # where the recording itself was late
                 continue
             if not torch.equal(env.observe()["policy"], replayed[-1]):
                 replayed.append(env.observe()["policy"])
@@ -66,7 +66,7 @@ def test_one_script_on_simulation_emulator_and_log(script, touch, tmp_path):
     torch.testing.assert_close(torch.cat(replayed), torch.cat(distinct), rtol=0, atol=0)
 
 
-def test_the_script_itself(script, monkeypatch, capsys):
+def test_the_script_runs_as_a_program(script, monkeypatch, capsys):
     for source in ("simulation", "emulator"):
         monkeypatch.setattr("sys.argv", ["any_source.py", "--source", source, "--steps", "20"])
         script["main"]()
@@ -75,7 +75,7 @@ def test_the_script_itself(script, monkeypatch, capsys):
         assert lines[2].split()[:3] == ["0.40", "s", "|force|"]
 
 
-def test_a_log_gives_what_a_hand_gives(touch, tmp_path):
+def test_a_log_gives_only_the_terms_of_a_hand(touch, tmp_path):
     with pytest.raises(TgdslError):
         tgdsl.connect(touch, tmp_path / "none.npz")
     document = {"tgdsl": 1, "robot": {"model": "xhand1"}, "scene": {"model": str(EXAMPLES / "palm_cube.xml")}}

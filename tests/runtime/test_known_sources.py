@@ -1,4 +1,4 @@
-"""Sources that installed packages bring, simulators among them; MuJoCo Warp connected to like any other; unknown options."""
+"""Sources of installed packages, including simulators; MuJoCo Warp as a source; unknown options."""
 
 import re
 import warnings
@@ -77,12 +77,12 @@ def install(tmp_path, monkeypatch):
 
 
 def observed(folder):
-    """Return a module that observes its only sensor, the depth of taxels that touch at the start."""
+    """Return a module that observes its only sensor, the depth of taxels in contact at the start."""
     pressed = SCENE.replace('pos="0 0 .0299"', 'pos="0 0 .028"').replace('qpos="0 0 .0299', 'qpos="0 0 .028')
     return module(folder, pressed, kind="contact_depth", observations={"policy": [{"type": "depth", "of": "touch"}]})
 
 
-# of installed packages
+# installed packages
 
 
 def test_an_installed_source_is_connected_to_by_its_name(install, tmp_path):
@@ -105,7 +105,7 @@ def test_an_installed_source_is_connected_to_by_its_name(install, tmp_path):
         assert env.source.gain == 2.0
 
 
-def test_options_that_a_source_has_no_use_for_are_left_out_and_unknown_ones_refused(install, tmp_path):
+def test_inapplicable_options_are_dropped_and_unknown_ones_refused(install, tmp_path):
     install("handy", "1.2", fingertip="handy:FINGERTIP")
     touch = module(tmp_path)
     with tgdsl.connect(touch, "fingertip", keyframe="home", lockstep=True) as env:
@@ -118,20 +118,20 @@ def test_options_that_a_source_has_no_use_for_are_left_out_and_unknown_ones_refu
 
 
 @pytest.mark.parametrize("source", ["simulation", "emulator", "xhand1:/dev/no-such-port", "press.npz", "warp:cpu"])
-def test_an_unknown_option_names_those_that_a_source_of_ours_knows(tmp_path, source):
+def test_an_unknown_option_of_a_builtin_source_lists_the_known_ones(tmp_path, source):
     with pytest.raises(TgdslError, match=f'^"{source}" has no option "zzz"; known options: .*control_step'):
         tgdsl.connect(module(tmp_path), source, zzz=1)
 
 
-def test_an_unknown_source_lists_installed_ones_too(install, tmp_path):
+def test_an_unknown_source_lists_builtin_and_installed_ones(install, tmp_path):
     install("handy", "1.2", fingertip="handy:FINGERTIP")
     with pytest.raises(TgdslError) as caught:
         tgdsl.connect(module(tmp_path), "gazebo")
-    ours = '"simulation", "emulator", "xhand1", "xhand1:PORT", "warp", "warp:DEVICE", the path of a log, "….npz"'
-    assert str(caught.value) == f'unknown source "gazebo"; expected {ours} or "fingertip:PORT"'
+    builtin = '"simulation", "emulator", "xhand1", "xhand1:PORT", "warp", "warp:DEVICE", the path of a log, "….npz"'
+    assert str(caught.value) == f'unknown source "gazebo"; expected {builtin} or "fingertip:PORT"'
 
 
-def test_an_installed_simulator_is_taken_for_its_device(install, tmp_path):
+def test_an_installed_simulator_is_used_for_its_device(install, tmp_path):
     install("handy", "1.2", mine="handy:SIMULATOR")
     touch = module(tmp_path)
     sim = tgdsl.simulate(touch, 3, device="xpu:1", substeps=4)
@@ -142,7 +142,7 @@ def test_an_installed_simulator_is_taken_for_its_device(install, tmp_path):
         tgdsl.simulate(touch, 3, device="meta")
 
 
-def test_a_simulator_without_open_is_connected_by_what_it_simulates(install, tmp_path):
+def test_a_simulator_without_open_connects_through_simulate(install, tmp_path):
     install("handy", "1.2", plain="handy:PLAIN")
     touch = module(tmp_path)
     with tgdsl.connect(touch, "plain", num_envs=2, layers=4) as env:
@@ -159,7 +159,7 @@ def test_a_simulator_without_open_is_connected_by_what_it_simulates(install, tmp
         ("SIMULATION", 'two kinds of sources are called "simulation": one of tgdsl, one of handy 1.2; rename or remove one'),
     ],
 )
-def test_two_sources_of_one_name(install, point, message):
+def test_two_sources_of_one_name_are_refused(install, point, message):
     install("grippy", "0.3", fingertip="grippy:OTHER")
     install("handy", "1.2", fingertip=f"handy:{point}")
     with pytest.raises(TgdslError, match=f"^{message}$"):
@@ -174,7 +174,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("case", BROKEN)
-def test_a_source_that_cannot_be_had_is_left_out_with_a_warning_that_names_its_package(install, case):
+def test_a_broken_source_is_left_out_with_a_warning_that_names_its_package(install, case):
     value, why = BROKEN[case]
     install("handy", "1.2", broken=value, fingertip="handy:FINGERTIP")
     with pytest.warns(UserWarning, match="is left out") as caught:
@@ -189,39 +189,39 @@ def test_a_source_that_cannot_be_had_is_left_out_with_a_warning_that_names_its_p
 # MuJoCo Warp
 
 
-def test_warp_is_connected_to_like_any_other_source(tmp_path):
-    touch, other = (observed(tmp_path) for _ in range(2))
+def test_warp_connects_like_any_other_source(tmp_path):
+    touch, twin = (observed(tmp_path) for _ in range(2))
     control = np.array([0.3, -0.2])
     with tgdsl.connect(touch, "warp:cpu", num_envs=2, control_step=0.006, keyframe="home", nconmax=24) as env:
-        sim = tgdsl.WarpSimulation(other, 2, device="cpu", substeps=3, keyframe="home", nconmax=24)
+        sim = tgdsl.WarpSimulation(twin, 2, device="cpu", substeps=3, keyframe="home", nconmax=24)
         assert isinstance(env.source, tgdsl.WarpSimulation)
         assert (env.num_envs, env.control_step) == (2, pytest.approx(0.006))
         for _ in range(3):
             env.step(control)
             sim.step(control)
-            found, expected = env.observe()["policy"], other.observe(other(sim.state()))["policy"]
-            assert torch.equal(found, expected)
-        assert found.any()
+            observed_policy, expected = env.observe()["policy"], twin.observe(twin(sim.state()))["policy"]
+            assert torch.equal(observed_policy, expected)
+        assert observed_policy.any()
         env.reset([1])
         sim.reset([1])
-        assert torch.equal(env.observe()["policy"], other.observe(other(sim.state()))["policy"])
+        assert torch.equal(env.observe()["policy"], twin.observe(twin(sim.state()))["policy"])
 
 
-def test_warp_without_a_device_asks_for_cuda(tmp_path, monkeypatch):
-    asked = {}
+def test_warp_without_a_device_uses_cuda(tmp_path, monkeypatch):
+    arguments = {}
 
-    def started(self, touch, num_envs, *, device=None, **keys):
-        asked["device"] = device
+    def record_device(self, touch, num_envs, *, device=None, **keys):
+        arguments["device"] = device
         raise SimulationError("no GPU here")
 
-    monkeypatch.setattr(tgdsl.WarpSimulation, "__init__", started)
+    monkeypatch.setattr(tgdsl.WarpSimulation, "__init__", record_device)
     for source, device in (("warp", "cuda"), ("warp:cuda:1", "cuda:1")):
         with pytest.raises(SimulationError, match="no GPU here"):
             tgdsl.connect(module(tmp_path), source)
-        assert asked["device"] == device
+        assert arguments["device"] == device
 
 
-def test_warp_refuses_what_no_simulation_can_observe(tmp_path):
+def test_warp_refuses_terms_of_a_real_hand(tmp_path):
     touch = module(tmp_path, observations={"policy": [{"type": "taxel_counts"}]})
     with pytest.raises(ObservationError, match="which only a real XHand1 has, and no simulation"):
         tgdsl.connect(touch, "warp:cpu")

@@ -1,4 +1,4 @@
-"""A module remembers the episodes of one simulation: a second one is refused until the first is closed or let go of."""
+"""A module holds the state of one simulation: a second one is refused until the first is closed or released."""
 
 import copy
 import gc
@@ -22,14 +22,14 @@ TAKEN = (
 )
 
 
-def with_state(folder) -> tgdsl.TactileModule:
+def stateful_module(folder) -> tgdsl.TactileModule:
     return module(folder, PRESSED, links=("table",), **BIT)
 
 
 @pytest.mark.slow
 @BOTH
 def test_a_second_simulation_is_refused_and_the_first_goes_on(tmp_path, simulator):
-    touch = with_state(tmp_path)
+    touch = stateful_module(tmp_path)
     sim = simulator(touch, 2)
     assert touch(sim.state())["touch"].all()
     bits = touch.memory.get_buffer("touch:bit").clone()
@@ -39,17 +39,17 @@ def test_a_second_simulation_is_refused_and_the_first_goes_on(tmp_path, simulato
                 other(touch, num_envs)
     assert bits.all() and torch.equal(touch.memory.get_buffer("touch:bit"), bits)
     sim.step()
-    assert simulator(copy.deepcopy(touch), 2).num_envs == 2  # a copy has a memory of its own
+    assert simulator(copy.deepcopy(touch), 2).num_envs == 2  # a copy has its own memory
     assert torch.equal(touch.memory.get_buffer("touch:bit"), bits)
 
 
 @BOTH
-def test_a_simulation_that_is_closed_lets_go_and_can_no_longer_be_used(tmp_path, simulator):
-    touch = with_state(tmp_path)
+def test_a_closed_simulation_releases_its_module_and_cannot_be_used(tmp_path, simulator):
+    touch = stateful_module(tmp_path)
     first = simulator(touch, 2)
     first.close()
     second = simulator(touch, 2)
-    first.close()  # once more does nothing, and leaves the second one its module
+    first.close()  # closing again does nothing to the second one
     with pytest.raises(SimulationError, match=TAKEN):
         simulator(touch, 2)
     calls = [first.step, first.state, first.reset, first.set_state, first.forward, lambda: next(first.substates())]
@@ -61,9 +61,9 @@ def test_a_simulation_that_is_closed_lets_go_and_can_no_longer_be_used(tmp_path,
 
 @pytest.mark.slow
 @BOTH
-def test_a_simulation_that_nobody_holds_lets_go(tmp_path, simulator):
-    touch = with_state(tmp_path)
-    gc.disable()  # a simulation may hold itself, and is then found when it is looked for
+def test_an_unreferenced_simulation_releases_its_module(tmp_path, simulator):
+    touch = stateful_module(tmp_path)
+    gc.disable()  # reference cycles would delay its release
     try:
         for _ in range(3):
             sim = simulator(touch, 2)
@@ -74,15 +74,15 @@ def test_a_simulation_that_nobody_holds_lets_go(tmp_path, simulator):
 
 
 @BOTH
-def test_a_module_without_state_is_read_by_as_many_as_like(tmp_path, simulator):
+def test_a_module_without_state_serves_any_number_of_simulations(tmp_path, simulator):
     touch = module(tmp_path)
     sims = [simulator(touch, num_envs) for num_envs in (1, 2, 3)]
     assert [len(touch(sim.state())["touch"]) for sim in sims] == [1, 2, 3]
 
 
 @BOTH
-def test_a_module_that_holds_the_state_of_others_is_refused_by_name(tmp_path, simulator):
-    touch = with_state(tmp_path)
+def test_a_module_with_the_state_of_other_environments_is_refused(tmp_path, simulator):
+    touch = stateful_module(tmp_path)
     touch(touch.example_state(2))
     message = r"^this module holds the state of 2 environments, and num_envs is 16; touch\.free\(\) frees it$"
     with pytest.raises(SimulationError, match=message):
@@ -93,8 +93,8 @@ def test_a_module_that_holds_the_state_of_others_is_refused_by_name(tmp_path, si
     assert len(touch(simulator(touch, 16).state())["touch"]) == 16
 
 
-def test_a_simulation_that_could_not_be_made_reads_nothing(tmp_path):
-    touch = with_state(tmp_path)
+def test_a_simulation_that_failed_to_start_claims_no_module(tmp_path):
+    touch = stateful_module(tmp_path)
     with pytest.raises(SimulationError, match=r"no keyframe"):
         BatchSimulation(touch, 2, keyframe="nowhere")
     with pytest.raises(SimulationError, match=r"no keyframe"):
@@ -102,8 +102,8 @@ def test_a_simulation_that_could_not_be_made_reads_nothing(tmp_path):
     assert BatchSimulation(touch, 2).num_envs == 2
 
 
-def test_connections_let_go(tmp_path):
-    touch = with_state(tmp_path)
+def test_closed_connections_release_their_module(tmp_path):
+    touch = stateful_module(tmp_path)
     for _ in range(2):
         with tgdsl.connect(touch, "simulation", control_step=0.002) as env:
             env.step()

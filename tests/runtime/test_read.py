@@ -1,4 +1,4 @@
-"""States of scenes that others step: the same as those of tgdsl's simulations, and of MuJoCo's own functions."""
+"""States of scenes that users step, against tgdsl's simulations and MuJoCo's functions."""
 
 import dataclasses
 import re
@@ -20,8 +20,8 @@ from tgdsl.runtime.batch.simulation import BatchSimulation
 JOINTS = ("joint_pos", "joint_vel", "joint_effort", "last_action")
 
 
-def wanting_all(folder) -> tuple[TactileModule, mujoco.MjModel]:
-    """Return a module that wants contacts and joints, and a scene with its contact sensors."""
+def module_wanting_all(folder) -> tuple[TactileModule, mujoco.MjModel]:
+    """Return a module that wants contacts and joints, and a model with its contact sensors."""
     touch, model = wanting_contacts(folder)
     inputs = dataclasses.replace(
         touch.inputs, fields=(*touch.inputs.fields, *JOINTS), joints=("two", "one"), actuators=("two", "one")
@@ -29,8 +29,8 @@ def wanting_all(folder) -> tuple[TactileModule, mujoco.MjModel]:
     return TactileModule(dataclasses.replace(touch.plan, inputs=inputs)), model
 
 
-def moved(model, seed) -> mujoco.MjData:
-    """Return data some steps after the keyframe, with random controls, evaluated where the joints are."""
+def moved_data(model, seed) -> mujoco.MjData:
+    """Return data a few steps after the keyframe, with random controls, evaluated at its joints."""
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     data.ctrl[:] = np.random.default_rng(seed).normal(size=model.nu)
@@ -40,15 +40,15 @@ def moved(model, seed) -> mujoco.MjData:
 
 
 def host_forces(warp_model, warp_data):
-    """Return, for each contact, its environment and the force on its second geom's body in the world [N]."""
+    """Return each contact's environment and the force on its second geom's body, in the world frame [N]."""
     count = int(warp_data.nacon.numpy()[0])
     ids, forces = wp.array(np.arange(count), dtype=int), wp.zeros(count, dtype=wp.spatial_vector)
     mujoco_warp.contact_force(warp_model, warp_data, ids, True, forces)
     return list(zip(warp_data.contact.worldid.numpy()[:count], forces.numpy()[:, :3], strict=True))
 
 
-def attached(folder, touch, count=1) -> mujoco.MjSpec:
-    """Return a scene that holds the module's own one some times, as robots below "a/", "b/" and so on."""
+def spec_with_robots(folder, touch, count=1) -> mujoco.MjSpec:
+    """Return a scene with copies of the module's scene under the prefixes "a/", "b/" and so on."""
     spec = mujoco.MjSpec()
     spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -59,18 +59,18 @@ def attached(folder, touch, count=1) -> mujoco.MjSpec:
     return spec
 
 
-def assert_same(found, expected, tolerance):
+def assert_same(state, expected, tolerance):
     for field in dataclasses.fields(expected):
         value = getattr(expected, field.name)
         if isinstance(value, torch.Tensor):
             scale = max(float(value.abs().max()), 1e-3)
-            gap = float((getattr(found, field.name) - value).abs().max())
-            assert gap <= tolerance * scale, f"{field.name} is off by {gap / scale}"
+            error = float((getattr(state, field.name) - value).abs().max())
+            assert error <= tolerance * scale, f"{field.name} is off by {error / scale}"
 
 
-def test_plain_mujoco_is_read_as_a_batch_is(tmp_path):
-    touch, model = wanting_all(tmp_path)
-    envs = [moved(model, seed) for seed in range(3)]
+def test_read_mujoco_agrees_with_the_batch(tmp_path):
+    touch, model = module_wanting_all(tmp_path)
+    envs = [moved_data(model, seed) for seed in range(3)]
     sim = BatchSimulation(touch, 3, model=model)
     for name in ("qpos", "qvel", "ctrl", "qacc_warmstart"):
         sim.arrays[name].copy_(torch.from_numpy(np.stack([getattr(env, name) for env in envs])))
@@ -91,9 +91,9 @@ def _only(state, env) -> dict:
     return {name: v[env : env + 1] for name, v in values.items() if isinstance(v, torch.Tensor)}
 
 
-def test_velocities_and_forces_are_those_of_mujocos_own_functions(tmp_path):
-    touch, model = wanting_all(tmp_path)
-    data = moved(model, 1)
+def test_velocities_and_joints_match_mujocos_functions(tmp_path):
+    touch, model = module_wanting_all(tmp_path)
+    data = moved_data(model, 1)
     state = tgdsl.read_mujoco(touch, model, data)
     for i, name in enumerate(touch.inputs.bodies):
         twist = np.zeros(6)
@@ -104,9 +104,9 @@ def test_velocities_and_forces_are_those_of_mujocos_own_functions(tmp_path):
     assert [float(v) for v in state.last_action[0]] == [data.ctrl[1], data.ctrl[0]]
 
 
-def test_warp_of_anyones_making_is_read_as_mujoco_is(tmp_path):
-    touch, model = wanting_all(tmp_path)
-    data = moved(model, 2)
+def test_read_warp_agrees_with_read_mujoco(tmp_path):
+    touch, model = module_wanting_all(tmp_path)
+    data = moved_data(model, 2)
     warp_model = mujoco_warp.put_model(model)
     warp_data = mujoco_warp.put_data(model, data, nworld=2)
     mujoco_warp.forward(warp_model, warp_data)
@@ -131,25 +131,25 @@ def test_warp_of_anyones_making_is_read_as_mujoco_is(tmp_path):
     assert torch.equal(state.body_pos, before)  # a state is a copy
 
 
-def test_names_below_a_prefix_are_taken_by_their_end(tmp_path):
-    touch, model = wanting_all(tmp_path)
+def test_names_match_below_a_prefix(tmp_path):
+    touch, model = module_wanting_all(tmp_path)
     named = touch.inputs.renamed(prefix="a/")
-    nested = tgdsl.instrument(attached(tmp_path, touch), named).compile()
-    data, same = moved(model, 0), mujoco.MjData(nested)
+    nested = tgdsl.instrument(spec_with_robots(tmp_path, touch), named).compile()
+    data, nested_data = moved_data(model, 0), mujoco.MjData(nested)
     for name in ("qpos", "qvel", "ctrl"):
-        getattr(same, name)[:] = getattr(data, name)
-    mujoco.mj_forward(nested, same)
+        getattr(nested_data, name)[:] = getattr(data, name)
+    mujoco.mj_forward(nested, nested_data)
     expected = tgdsl.read_mujoco(touch, model, data)
-    found = tgdsl.read_mujoco(touch, nested, same)
-    assert_same(found, dataclasses.replace(expected, time=found.time), 1e-9)
-    there = tgdsl.read_mujoco(touch, nested, same, inputs=named)
-    assert_same(there, found, 0.0)
+    by_suffix = tgdsl.read_mujoco(touch, nested, nested_data)
+    assert_same(by_suffix, dataclasses.replace(expected, time=by_suffix.time), 1e-9)
+    by_name = tgdsl.read_mujoco(touch, nested, nested_data, inputs=named)
+    assert_same(by_name, by_suffix, 0.0)
 
 
 def test_ambiguous_names_are_refused_with_the_candidates(tmp_path):
     touch = module(tmp_path)
     named = [touch.inputs.renamed(prefix=prefix) for prefix in ("a/", "b/")]
-    spec = attached(tmp_path, touch, 2)
+    spec = spec_with_robots(tmp_path, touch, 2)
     for inputs in named:
         tgdsl.instrument(spec, inputs)
     two = spec.compile()
@@ -163,16 +163,16 @@ def test_ambiguous_names_are_refused_with_the_candidates(tmp_path):
     assert torch.allclose(shift, torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
 
 
-def test_data_that_was_never_evaluated_is_refused(tmp_path):
-    touch, model = wanting_all(tmp_path)
+def test_unevaluated_data_is_refused(tmp_path):
+    touch, model = module_wanting_all(tmp_path)
     data = mujoco.MjData(model)
     with pytest.raises(SimulationError, match=r"call mujoco\.mj_forward\(model, data\) first"):
-        tgdsl.read_mujoco(touch, model, [moved(model, 1), data])
+        tgdsl.read_mujoco(touch, model, [moved_data(model, 1), data])
     mujoco.mj_forward(model, data)
     assert tgdsl.read_mujoco(touch, model, data).body_quat.norm(dim=-1).allclose(torch.ones(1, dtype=torch.float64))
 
 
-def test_a_body_that_the_scene_lacks_is_named_with_the_nearest(tmp_path):
+def test_a_missing_body_is_named_with_a_suggestion(tmp_path):
     touch = module(tmp_path)
     other = mujoco.MjModel.from_xml_string(SCENE.replace('"pad"', '"pad_"'))
     with pytest.raises(SimulationError, match=re.escape('the scene has no body "pad"; did you mean "pad_"?')):

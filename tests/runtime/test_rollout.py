@@ -1,4 +1,4 @@
-"""Controls against sums by hand, recordings against what they were made of."""
+"""Scripted controls against values by hand, and recordings against their inputs."""
 
 from pathlib import Path
 
@@ -60,20 +60,20 @@ MODEL = mujoco.MjModel.from_xml_string(SCENE)
 
 
 def test_scripted_controls_hold_and_move():
-    found = scripted_controls(MODEL, ("rest", "squeeze"), seconds=0.05, control_step=0.01)
+    controls = scripted_controls(MODEL, ("rest", "squeeze"), seconds=0.05, control_step=0.01)
     ramp = [[0, 1], [-1.25, 1.5], [-2.5, 2], [-3.75, 2.5], [-5, 3]]
-    np.testing.assert_allclose(found, [[0, 1]] * 5 + ramp + [[-5, 3]] * 5)
+    np.testing.assert_allclose(controls, [[0, 1]] * 5 + ramp + [[-5, 3]] * 5)
 
 
-def test_scripted_controls_of_three_and_of_one():
-    found = scripted_controls(MODEL, ("rest", "squeeze", "up"), 0.02, 0.01)
+def test_scripted_controls_accept_three_or_one_keyframes():
+    controls = scripted_controls(MODEL, ("rest", "squeeze", "up"), 0.02, 0.01)
     rest, squeeze, up = [0, 1], [-5, 3], [1, 1]
-    np.testing.assert_array_equal(found, [rest, rest, rest, squeeze, squeeze, squeeze, squeeze, up, up, up])
+    np.testing.assert_array_equal(controls, [rest, rest, rest, squeeze, squeeze, squeeze, squeeze, up, up, up])
     np.testing.assert_array_equal(scripted_controls(MODEL, ("up",), 0.03, 0.01), [[1, 1]] * 3)
-    np.testing.assert_array_equal(scripted_controls(MODEL, ("up",), 1e-6, 0.01), [[1, 1]])  # never none at all
+    np.testing.assert_array_equal(scripted_controls(MODEL, ("up",), 1e-6, 0.01), [[1, 1]])  # always at least one step
 
 
-def test_scripted_controls_errors():
+def test_invalid_scripts_are_refused():
     with pytest.raises(SimulationError) as caught:
         scripted_controls(MODEL, ("rest", "sqeeze"), 1.0, 0.01)
     assert str(caught.value) == 'the scene has no keyframe "sqeeze"; did you mean "squeeze"?'
@@ -86,12 +86,12 @@ def test_scripted_controls_errors():
 
 
 @pytest.mark.parametrize("shape", [(4, 2), (4, 3, 2)])
-def test_recorded_controls_come_back(tmp_path, shape):
+def test_recorded_controls_round_trip(tmp_path, shape):
     controls = np.random.default_rng(0).normal(size=shape).astype(np.float32)
     np.savez_compressed(tmp_path / "c.npz", ctrl=controls, other=np.zeros(3))
-    found = recorded_controls(tmp_path / "c.npz")
-    assert found.dtype == np.float64
-    np.testing.assert_array_equal(found, controls)
+    loaded = recorded_controls(tmp_path / "c.npz")
+    assert loaded.dtype == np.float64
+    np.testing.assert_array_equal(loaded, controls)
 
 
 @pytest.mark.parametrize(
@@ -106,14 +106,14 @@ def test_recorded_controls_come_back(tmp_path, shape):
     ],
     ids=["name", "flat", "integers", "no_steps", "text", "objects"],
 )
-def test_recorded_controls_of_other_contents(tmp_path, arrays, message):
+def test_invalid_recorded_controls_are_refused(tmp_path, arrays, message):
     np.savez(tmp_path / "c.npz", **arrays)
     with pytest.raises(SimulationError) as caught:
         recorded_controls(tmp_path / "c.npz")
     assert str(caught.value).startswith(f"{tmp_path / 'c.npz'}: {message}")
 
 
-def test_recorded_controls_that_are_no_archive(tmp_path):
+def test_recorded_controls_that_are_not_an_archive_are_refused(tmp_path):
     np.savez(tmp_path / "whole.npz", ctrl=np.zeros((3, 2)))
     (tmp_path / "cut.npz").write_bytes((tmp_path / "whole.npz").read_bytes()[:60])
     (tmp_path / "text.npz").write_text("hello")
@@ -124,7 +124,7 @@ def test_recorded_controls_that_are_no_archive(tmp_path):
             recorded_controls(tmp_path / name)
 
 
-def test_rollout_is_the_loop_that_a_user_writes(document):
+def test_rollout_equals_the_loop_of_a_user(document):
     touch = tgdsl.compile(document)
     controls = scripted_controls(MODEL, ("rest", "squeeze"), 0.04, 0.01)
     steps = list(rollout(touch, simulate(touch, 2, substeps=2), controls))
@@ -138,7 +138,7 @@ def test_rollout_is_the_loop_that_a_user_writes(document):
     assert steps[-1].readings["depth"].max() > 0
 
 
-def test_controls_for_each_environment(document):
+def test_controls_may_differ_between_environments(document):
     touch = tgdsl.compile(document)
     controls = np.zeros((3, 2, 2))
     controls[:, 1, 0] = 100.0  # lifts the second cube
@@ -149,48 +149,51 @@ def test_controls_for_each_environment(document):
 
 
 @pytest.mark.parametrize("controls", [np.zeros((3, 2)), np.zeros((3, 4, 2))], ids=["for_all", "for_each"])
-def test_recorder_file(document, tmp_path, controls):
+def test_a_recording_has_its_readings_units_and_layout(document, tmp_path, controls):
     touch = tgdsl.compile(document)
     recorder = Recorder(touch, 3, 4)
     rng = np.random.default_rng(0)
-    kept = {output.name: rng.normal(size=(3, 4, *output.shape)).astype(np.float32) for output in touch.outputs}
+    recorded = {output.name: rng.normal(size=(3, 4, *output.shape)).astype(np.float32) for output in touch.outputs}
     for index in range(3):
-        readings = {name: torch.from_numpy(values[index]).double().requires_grad_() for name, values in kept.items()}
+        readings = {name: torch.from_numpy(values[index]).double().requires_grad_() for name, values in recorded.items()}
         recorder.add(Step(index, 0.1 * (index + 1), readings, torch.full((4, 7), float(index))))
     recorder.write(tmp_path / "r.npz", controls, Path("scene.yaml"), ["a", "b"])
     with np.load(tmp_path / "r.npz", allow_pickle=False) as archive:
-        found = dict(archive)
-    units = {f"{name}:{part}" for name in kept for part in ("channels", "units")}
-    places = {f"{name}:{part}" for name in kept for part in ("link", "body", "pos", "normal", "area")}
-    assert found.keys() == {"time", "ctrl", "actuators", "qpos", "document", "touch", "touch/clean", "depth"} | units | places
-    np.testing.assert_allclose(found["time"], [0.1, 0.2, 0.3])
-    np.testing.assert_array_equal(found["ctrl"], controls)
-    for name, values in kept.items():
-        assert found[name].dtype == np.float32
-        np.testing.assert_array_equal(found[name], values)
-    assert found["touch:channels"].tolist() == ["force_x", "force_y", "force_z"]
-    assert found["touch/clean:units"].tolist() == ["N"] * 3
-    assert (found["depth:channels"].tolist(), found["depth:units"].tolist()) == (["depth"], ["m"])
-    for name in kept:  # the points of the layout, by hand
-        assert found[f"{name}:link"].tolist() == found[f"{name}:body"].tolist() == ["pad"] * 3
-        np.testing.assert_allclose(found[f"{name}:pos"], [[0, 0, 0.01], [0.01, 0, 0.01], [0.025, 0, 0.01]])
-        np.testing.assert_allclose(found[f"{name}:normal"], [[0, 0, 1]] * 3)
-        np.testing.assert_allclose(found[f"{name}:area"], np.pi * 0.004**2)
+        arrays = dict(archive)
+    units = {f"{name}:{part}" for name in recorded for part in ("channels", "units")}
+    layout_keys = {f"{name}:{part}" for name in recorded for part in ("link", "body", "pos", "normal", "area")}
+    assert (
+        arrays.keys()
+        == {"time", "ctrl", "actuators", "qpos", "document", "touch", "touch/clean", "depth"} | units | layout_keys
+    )
+    np.testing.assert_allclose(arrays["time"], [0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(arrays["ctrl"], controls)
+    for name, values in recorded.items():
+        assert arrays[name].dtype == np.float32
+        np.testing.assert_array_equal(arrays[name], values)
+    assert arrays["touch:channels"].tolist() == ["force_x", "force_y", "force_z"]
+    assert arrays["touch/clean:units"].tolist() == ["N"] * 3
+    assert (arrays["depth:channels"].tolist(), arrays["depth:units"].tolist()) == (["depth"], ["m"])
+    for name in recorded:  # the points of the layout, by hand
+        assert arrays[f"{name}:link"].tolist() == arrays[f"{name}:body"].tolist() == ["pad"] * 3
+        np.testing.assert_allclose(arrays[f"{name}:pos"], [[0, 0, 0.01], [0.01, 0, 0.01], [0.025, 0, 0.01]])
+        np.testing.assert_allclose(arrays[f"{name}:normal"], [[0, 0, 1]] * 3)
+        np.testing.assert_allclose(arrays[f"{name}:area"], np.pi * 0.004**2)
     assert [path.name for path in tmp_path.iterdir()] == ["r.npz"]
 
 
-def test_a_recording_of_bodies_says_which(document, tmp_path):
+def test_a_recording_of_bodies_names_them(document, tmp_path):
     sensors = {"solver": {"kind": "link_contact", "links": "pad", "feels": ["cube"]}}
     touch = tgdsl.compile({**document, "sensors": sensors})
     recorder = Recorder(touch, 1, 1)
     recorder.add(Step(0, 0.1, {"solver": torch.zeros(1, 1, 4)}, torch.zeros(1, 7)))
     recorder.write(tmp_path / "r.npz", np.zeros((1, 2)), Path("scene.yaml"), ["a", "b"])
-    with np.load(tmp_path / "r.npz", allow_pickle=False) as found:
-        assert found["solver:body"].tolist() == ["pad"]
-        assert not {"solver:pos", "solver:link"} & set(found)
+    with np.load(tmp_path / "r.npz", allow_pickle=False) as archive:
+        assert archive["solver:body"].tolist() == ["pad"]
+        assert not {"solver:pos", "solver:link"} & set(archive)
 
 
-def test_a_recording_that_fails_leaves_nothing(document, tmp_path, monkeypatch):
+def test_a_failed_recording_leaves_no_file(document, tmp_path, monkeypatch):
     recorder = Recorder(tgdsl.compile(document), 1, 1)
 
     def fail(*_: object) -> None:
@@ -203,17 +206,17 @@ def test_a_recording_that_fails_leaves_nothing(document, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("clearance", [-1e-3, 1e-3])
-def test_an_object_is_touched_where_it_is_less_than_its_size_away(document, clearance):
+def test_an_object_is_touched_when_surfaces_overlap(document, clearance):
     touch = tgdsl.compile(document)
     sim = simulate(touch, 2)
-    sim.set_state([0], qpos=np.array([0.001 + clearance, 0.0]))  # the scene has it a millimetre deep
+    sim.set_state([0], qpos=np.array([0.001 + clearance, 0.0]))  # at 0, the cube is a millimetre deep
     sim.set_state([1], qpos=np.array([0.001 - clearance, 0.0]))
     assert bool(touching_bodies(touch, sim)) == (clearance < 0)
 
 
 @pytest.mark.parametrize(("clearance", "is_contact"), [(-1e-3, True), (1e-3, True), (3e-3, False), (6e-3, False)])
-def test_within_a_gap_nothing_is_touched(document, tmp_path, clearance, is_contact):
-    """Nearer than the margin of 2 mm MuJoCo makes constraints; in the gap of 3 mm beyond it only finds the contact."""
+def test_within_a_gap_no_object_is_touched(document, tmp_path, clearance, is_contact):
+    """Within the margin of 2 mm MuJoCo makes constraints; in the gap of 3 mm beyond, it only detects contacts."""
     (tmp_path / "gap.xml").write_text(SCENE.replace('size=".03 .03 .01"', 'size=".03 .03 .01" margin=".002" gap=".003"'))
     touch = tgdsl.compile({**document, "robot": {**document["robot"], "model": str(tmp_path / "gap.xml")}})
     sim = simulate(touch, 1)
@@ -226,8 +229,8 @@ def test_within_a_gap_nothing_is_touched(document, tmp_path, clearance, is_conta
 
 
 @pytest.mark.parametrize("faces_up", [True, False])
-def test_taxels_on_the_side_that_nothing_touches_are_silent(document, faces_up):
-    """A grid along −z lies on the side that faces the cube, one along +z on the other; neither misses its link."""
+def test_taxels_on_an_untouched_side_are_silent(document, faces_up):
+    """A grid along −z lies on the side that faces the cube, one along +z on the other side."""
     grid = {"method": "grid", "rows": 2, "columns": 2, "direction": [0, 0, -1 if faces_up else 1], "radius": 0.002}
     layout = {"resolutions": {"o": {"pad": grid}}}
     sensors = {"depth": document["sensors"]["depth"]}
@@ -239,8 +242,8 @@ def test_taxels_on_the_side_that_nothing_touches_are_silent(document, faces_up):
 
 
 @pytest.mark.parametrize(("cube", "is_contact"), [(0.03, True), (0.1, False)])
-def test_what_is_flexible_may_touch_too(document, tmp_path, cube, is_contact):
-    """A cloth lies in a floor; MuJoCo names no geom of it, and the cube has the scene's last."""
+def test_touching_bodies_accepts_flexes(document, tmp_path, cube, is_contact):
+    """A cloth penetrates a floor; its contacts have no geom, and the cube has the last geom."""
     cloth = """<flexcomp name="cloth" type="grid" dim="2" count="3 3 1" spacing=".02 .02 .02" radius=".002" mass=".1" pos=".5 0 0">
       <contact selfcollide="none"/><edge equality="true"/></flexcomp>
     <geom name="floor" type="box" size=".1 .1 .01" pos=".5 0 -.01"/>"""
@@ -253,8 +256,8 @@ def test_what_is_flexible_may_touch_too(document, tmp_path, cube, is_contact):
 
 
 @pytest.mark.parametrize(("x", "is_told"), [(0.0, False), (0.022, True)])
-def test_a_load_that_no_taxel_is_near_is_told(tmp_path, x, is_told):
-    """A cube at rest weighs m g, on the only two taxels or two centimetres beside them."""
+def test_a_load_away_from_all_taxels_is_reported(tmp_path, x, is_told):
+    """A cube at rest presses with m g, on the taxels or two centimetres away."""
     scene = SCENE.replace(
         '<joint name="lift" type="slide" axis="0 0 1"/><joint name="slide" type="slide" axis="1 0 0"/>', "<freejoint/>"
     )
@@ -277,7 +280,7 @@ def test_a_load_that_no_taxel_is_near_is_told(tmp_path, x, is_told):
     sim = simulate(touch, 1)
     for _ in range(200):
         sim.step()
-    told = missed_loads(touch, touch(sim.state()))
+    messages = missed_loads(touch, touch(sim.state()))
     weight = f"{0.25 * 9.81:.3g}"
     expected = f'"load" misses {weight} of {weight} N, which act where none of its taxels is'
-    assert told == ({"load/missed": expected} if is_told else {})
+    assert messages == ({"load/missed": expected} if is_told else {})
