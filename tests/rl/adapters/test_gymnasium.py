@@ -1,4 +1,4 @@
-"""The environment of gymnasium: what it gives is what gymnasium's own SyncVectorEnv makes of the same episodes."""
+"""The gymnasium environment, compared with gymnasium's SyncVectorEnv on the same episodes."""
 
 import importlib
 import sys
@@ -23,34 +23,34 @@ NUM_ENVS, NUM_STEPS = 4, 2 * STEPS + 3
 @pytest.fixture(scope="module")
 def touch_env(tmp_path_factory):
     env = TouchEnv(small_task(tmp_path_factory.mktemp("gymnasium")), NUM_ENVS)
-    with pytest.warns(UserWarning, match="1 had controls that are not finite"):  # said once, here
+    with pytest.warns(UserWarning, match="1 had controls that are not finite"):  # shown once, here
         env.step(torch.tensor([[torch.nan, 0.0], *[[0.0, 0.0]] * (NUM_ENVS - 1)]))
     return env
 
 
 @pytest.fixture(scope="module")
 def actions():
-    """Random actions; those of environment 1 are once not finite, which ends its episode for good."""
-    drawn = np.random.default_rng(0).uniform(-1, 1, (NUM_STEPS, NUM_ENVS, 2)).astype(np.float32)
-    drawn[3, 1, 0] = np.nan
-    return drawn
+    """Random actions; a NaN terminates an episode of environment 1."""
+    values = np.random.default_rng(0).uniform(-1, 1, (NUM_STEPS, NUM_ENVS, 2)).astype(np.float32)
+    values[3, 1, 0] = np.nan
+    return values
 
 
-def staggered(env):
-    """Let environment 2 end its episodes at other steps than the others."""
+def stagger(env):
+    """Make the episodes of environment 2 end at other steps than the others."""
     env.steps[2] = 5
 
 
 @pytest.fixture(scope="module")
 def truth(touch_env, actions):
-    """The observations of a reset, and all steps, as tensors."""
+    """Observations of a reset and all steps, as tensors."""
     first = touch_env.reset(7)
-    staggered(touch_env)
+    stagger(touch_env)
     return SimpleNamespace(first=first, steps=[touch_env.step(torch.from_numpy(action)) for action in actions])
 
 
 class Row(gymnasium.Env):
-    """One environment of the truth, which SyncVectorEnv steps and resets."""
+    """One environment of `truth`, for SyncVectorEnv to step and reset."""
 
     def __init__(self, truth, env, space):
         self.truth, self.env, self.index = truth, env, -1
@@ -64,50 +64,50 @@ class Row(gymnasium.Env):
         self.index += 1
         made, row = self.truth.steps[self.index], self.env
         info = made.info
-        told = {"terms": {name: value[row].numpy()[()] for name, value in info.terms.items()}}
-        told |= {"episode_terms": {name: value[row].numpy()[()] for name, value in info.episode_terms.items()}}
-        told |= {name: getattr(info, name)[row].numpy()[()] for name in ("score", "episode_return", "episode_steps")}
-        told["faults"] = bool(info.faults[row])
+        step_info = {"terms": {name: value[row].numpy()[()] for name, value in info.terms.items()}}
+        step_info |= {"episode_terms": {name: value[row].numpy()[()] for name, value in info.episode_terms.items()}}
+        step_info |= {name: getattr(info, name)[row].numpy()[()] for name in ("score", "episode_return", "episode_steps")}
+        step_info["faults"] = bool(info.faults[row])
         obs = {name: value[row].numpy() for name, value in info.final_obs.items()}
-        return obs, float(made.reward[row]), bool(made.terminated[row]), bool(made.truncated[row]), told
+        return obs, float(made.reward[row]), bool(made.terminated[row]), bool(made.truncated[row]), step_info
 
 
-def same(found, expected, where=""):
-    """Compare nested dictionaries and arrays, types and all."""
-    assert type(found) is type(expected), where
+def assert_same(actual, expected, where=""):
+    """Compare nested dictionaries and arrays, including types."""
+    assert type(actual) is type(expected), where
     if isinstance(expected, dict):
-        assert found.keys() == expected.keys(), where
+        assert actual.keys() == expected.keys(), where
         for name, value in expected.items():
-            same(found[name], value, f"{where}/{name}")
+            assert_same(actual[name], value, f"{where}/{name}")
     elif isinstance(expected, tuple):
-        same(dict(enumerate(found)), dict(enumerate(expected)), where)
+        assert_same(dict(enumerate(actual)), dict(enumerate(expected)), where)
     elif isinstance(expected, np.ndarray):
-        assert (found.dtype, found.shape) == (expected.dtype, expected.shape), where
+        assert (actual.dtype, actual.shape) == (expected.dtype, expected.shape), where
         if expected.dtype == object:
-            for i, (mine, theirs) in enumerate(zip(found, expected, strict=True)):
-                same(mine, theirs, f"{where}[{i}]")
+            for i, (actual_item, expected_item) in enumerate(zip(actual, expected, strict=True)):
+                assert_same(actual_item, expected_item, f"{where}[{i}]")
         else:
-            np.testing.assert_array_equal(found, expected, err_msg=where)
+            np.testing.assert_array_equal(actual, expected, err_msg=where)
     else:
-        assert found == expected, where
+        assert actual == expected, where
 
 
-def test_it_gives_what_sync_vector_env_makes_of_the_same_episodes(touch_env, truth, actions):
-    """Observations, rewards, ends, and all of `info`: final observations, nested dictionaries, masks, zeros, dtypes, keys."""
+def test_it_equals_sync_vector_env(touch_env, truth, actions):
+    """Observations, rewards, ends and all of `info`: final observations, nesting, masks, zeros, dtypes, keys."""
     env = TouchVectorEnv(touch_env)
     rows = [lambda i=i: Row(truth, i, env.single_observation_space) for i in range(NUM_ENVS)]
     reference = SyncVectorEnv(rows, autoreset_mode=AutoresetMode.SAME_STEP)
-    same(env.reset(seed=7), reference.reset())
-    staggered(touch_env)
+    assert_same(env.reset(seed=7), reference.reset())
+    stagger(touch_env)
     ends = []
     for action in actions:
-        found, expected = env.step(action), reference.step(action)
-        same(found[0], expected[0])
-        np.testing.assert_array_equal(found[1], expected[1].astype(np.float32))
-        same(found[2:], expected[2:])
-        ends.append((list(np.flatnonzero(found[2])), list(np.flatnonzero(found[3]))))
+        actual, expected = env.step(action), reference.step(action)
+        assert_same(actual[0], expected[0])
+        np.testing.assert_array_equal(actual[1], expected[1].astype(np.float32))
+        assert_same(actual[2:], expected[2:])
+        ends.append((list(np.flatnonzero(actual[2])), list(np.flatnonzero(actual[3]))))
     expected = {2: ([], [2]), 3: ([1], []), 7: ([], [0, 3]), 10: ([], [2]), 11: ([], [1]), 15: ([], [0, 3]), 18: ([], [2])}
-    assert {step: which for step, which in enumerate(ends) if which != ([], [])} == expected
+    assert {step: envs for step, envs in enumerate(ends) if envs != ([], [])} == expected
 
 
 def test_spaces(touch_env):
@@ -132,98 +132,100 @@ def test_spaces(touch_env):
 def test_a_seed_gives_the_same_episodes(touch_env, actions):
     env = TouchVectorEnv(touch_env)
 
-    def played(seed):
+    def play(seed):
         first, _ = env.reset(seed=seed)
         return [first, *(env.step(action)[0] for action in actions)]
 
-    once, again, other = played(3), played(np.int64(3)), played(4)
-    same(dict(enumerate(again)), dict(enumerate(once)))
-    assert not np.array_equal(other[0]["priv_obj_state"], once[0]["priv_obj_state"])
+    first_run, repeated, other = play(3), play(np.int64(3)), play(4)
+    assert_same(dict(enumerate(repeated)), dict(enumerate(first_run)))
+    assert not np.array_equal(other[0]["priv_obj_state"], first_run[0]["priv_obj_state"])
     assert env.np_random_seed == 4
     np.testing.assert_raises(AssertionError, np.testing.assert_array_equal, env.reset()[0]["goal"], other[0]["goal"])
 
 
-def test_what_was_handed_out_stays_as_it_was(touch_env, actions):
+def test_returned_observations_are_not_overwritten(touch_env, actions):
     env = TouchVectorEnv(touch_env)
-    given, _ = env.reset(seed=3)
-    before = {name: value.copy() for name, value in given.items()}
+    obs, _ = env.reset(seed=3)
+    copy = {name: value.copy() for name, value in obs.items()}
     for action in actions:
         result = env.step(action)
-        same(given, before)
-        given, before = result[0], {name: value.copy() for name, value in result[0].items()}
+        assert_same(obs, copy)
+        obs, copy = result[0], {name: value.copy() for name, value in result[0].items()}
 
 
-def test_tensors_are_the_same_numbers(touch_env, actions):
-    """Rows that masks leave out mean nothing; masks are always there."""
+def test_tensors_equal_arrays(touch_env, actions):
+    """Masks are always present; rows that they leave out are undefined."""
     arrays, tensors = TouchVectorEnv(touch_env), TouchVectorEnv(touch_env, output="torch")
     arrays.reset(seed=7)
     expected = [arrays.step(action) for action in actions]
     first, info = tensors.reset(seed=7)
     assert info == {} and all(isinstance(value, torch.Tensor) for value in first.values())
-    for action, (obs, reward, terminated, truncated, told) in zip(actions, expected, strict=True):
+    for action, (obs, reward, terminated, truncated, expected_info) in zip(actions, expected, strict=True):
         result = tensors.step(torch.from_numpy(action))
-        same({name: value.numpy() for name, value in result[0].items()}, obs)
-        same(tuple(value.numpy() for value in result[1:4]), (reward, terminated, truncated))
+        assert_same({name: value.numpy() for name, value in result[0].items()}, obs)
+        assert_same(tuple(value.numpy() for value in result[1:4]), (reward, terminated, truncated))
         ended, info = terminated | truncated, result[4]
-        same(info["_final_obs"].numpy(), ended)
-        same(info["_score"].numpy(), ~ended)
+        assert_same(info["_final_obs"].numpy(), ended)
+        assert_same(info["_score"].numpy(), ~ended)
         assert set(info) == {
             *STEP_KEYS,
             *(f"_{name}" for name in STEP_KEYS),
             *("final_obs", "_final_obs", "final_info", "_final_info"),
         }
         if ended.any():
-            terms = told["final_info"]["episode_terms"]
+            terms = expected_info["final_info"]["episode_terms"]
             for name, value in info["final_info"]["episode_terms"].items():
                 np.testing.assert_array_equal(value.numpy()[ended], terms[name][ended])
             for row in np.flatnonzero(ended):
-                same({name: value[row].numpy() for name, value in info["final_obs"].items()}, told["final_obs"][row])
+                assert_same(
+                    {name: value[row].numpy() for name, value in info["final_obs"].items()}, expected_info["final_obs"][row]
+                )
 
 
-def test_chosen_groups_alone_in_their_order(touch_env, actions):
+def test_only_the_chosen_groups_are_returned_in_order(touch_env, actions):
     env = TouchVectorEnv(touch_env, groups=("goal", "proprio"))
     assert list(env.single_observation_space.spaces) == ["goal", "proprio"]
     assert list(env.reset(seed=1)[0]) == ["goal", "proprio"]
     infos = [env.step(action)[4] for action in actions]
-    given = next(info["final_obs"][0] for info in infos if "final_obs" in info and info["final_obs"][0] is not None)
-    assert list(given) == ["goal", "proprio"]
+    final_obs = next(info["final_obs"][0] for info in infos if "final_obs" in info and info["final_obs"][0] is not None)
+    assert list(final_obs) == ["goal", "proprio"]
 
 
-def test_actions_of_other_types(touch_env, actions):
+def test_actions_of_other_types_are_accepted(touch_env, actions):
     env = TouchVectorEnv(touch_env)
 
-    def after(action):
+    def obs_after(action):
         env.reset(seed=5)
         return env.step(action)[0]
 
-    expected = after(actions[0])
+    expected = obs_after(actions[0])
     for action in (
         actions[0].astype(np.float64),
         torch.from_numpy(actions[0]),
         actions[0].tolist(),
         np.asfortranarray(actions[0]),
     ):
-        same(after(action), expected)
+        assert_same(obs_after(action), expected)
 
 
 # Wrappers
 
 
-def test_infos_as_a_list(touch_env, truth, actions):
+def test_infos_can_be_a_list(touch_env, truth, actions):
     env = vector.DictInfoToList(TouchVectorEnv(touch_env))
     assert env.reset(seed=7)[1] == [{}] * NUM_ENVS
-    staggered(touch_env)
+    stagger(touch_env)
     for action, made in zip(actions, truth.steps, strict=True):
         for row, info in enumerate(env.step(action)[4]):
             ended = bool(made.info.ended[row])
             assert set(info) == ({"final_obs", "final_info"} if ended else set(STEP_KEYS))
-            told = info["final_info"] if ended else info
-            assert told["terms"]["tilt"] == made.info.terms["tilt"][row]
-            assert told["episode_steps"] == made.info.episode_steps[row]
+            episode_info = info["final_info"] if ended else info
+            assert episode_info["terms"]["tilt"] == made.info.terms["tilt"][row]
+            assert episode_info["episode_steps"] == made.info.episode_steps[row]
 
 
 @pytest.mark.parametrize("wrapper", [vector.FlattenObservation, vector.NormalizeObservation])
-def test_wrappers_of_observations_refuse_this_mode_of_anyone(touch_env, wrapper):
+def test_gymnasiums_observation_wrappers_refuse_this_autoreset_mode(touch_env, wrapper):
     with pytest.raises(ValueError, match=r"NEXT_STEP.*SAME_STEP"):
         wrapper(TouchVectorEnv(touch_env))
 
@@ -231,7 +233,7 @@ def test_wrappers_of_observations_refuse_this_mode_of_anyone(touch_env, wrapper)
 # Wrong use
 
 
-def test_wrong_use(touch_env):
+def test_wrong_use_is_refused(touch_env):
     env = TouchVectorEnv(touch_env)
     cases = [
         (lambda: TouchVectorEnv(touch_env, output="jax"), 'output is "jax", expected "numpy" or "torch"'),
@@ -254,7 +256,7 @@ def test_without_gymnasium_the_error_names_what_to_install(monkeypatch):
         importlib.import_module("tgdsl.rl.adapters.gymnasium")
 
 
-def test_close(tmp_path):
+def test_close_closes_the_environment(tmp_path):
     touch_env = TouchEnv(small_task(tmp_path), 1)
     env = TouchVectorEnv(touch_env)
     env.close()

@@ -1,4 +1,4 @@
-"""The environment of gymnasium, of the CPU and of a GPU: what it gives is what the step has brought, on the host or where it is."""
+"""The gymnasium environment on CPU and GPU: it returns the step's values, as arrays on the host or tensors on the device."""
 
 import numpy as np
 import pytest
@@ -15,27 +15,27 @@ NUM_ENVS, NUM_STEPS = 6, 2 * STEPS + 3
 @pytest.fixture(scope="module", params=DEVICES)
 def touch_env(request, tmp_path_factory):
     env = TouchEnv(small_task(tmp_path_factory.mktemp("gymnasium")), NUM_ENVS, device=request.param)
-    with pytest.warns(UserWarning, match="1 had controls that are not finite"):  # said once, here
+    with pytest.warns(UserWarning, match="1 had controls that are not finite"):  # shown once, here
         have_a_fault(env)
     yield env
     env.close()
 
 
 @pytest.fixture
-def made(touch_env, monkeypatch):
-    """Every step of the environment itself."""
+def recorded_steps(touch_env, monkeypatch):
+    """Return a list that records every step of the environment itself."""
     steps, step = [], touch_env.step
 
-    def noted(action):
+    def recording_step(action):
         steps.append(step(action))
         return steps[-1]
 
-    monkeypatch.setattr(touch_env, "step", noted)
+    monkeypatch.setattr(touch_env, "step", recording_step)
     return steps
 
 
-def drawn(seed):
-    """Random actions; those of environment 1 are once not finite, which ends its episode for good."""
+def random_actions(seed):
+    """Return random actions; a NaN terminates an episode of environment 1."""
     actions = np.random.default_rng(seed).uniform(-1, 1, (NUM_STEPS, NUM_ENVS, 2)).astype(np.float32)
     actions[3, 1, 0] = np.nan
     return actions
@@ -45,58 +45,58 @@ def on_host(value):
     return {name: on_host(part) for name, part in value.items()} if isinstance(value, dict) else value.cpu().numpy()
 
 
-def test_arrays_are_what_the_step_has_brought(touch_env, made):
-    """And the statistics of gymnasium are those of the environment: two episodes of each, and one of which half is left."""
+def test_arrays_equal_the_steps_tensors(touch_env, recorded_steps):
+    """Statistics of gymnasium agree too: two episodes of each environment, and one of environment 2 cut short."""
     env = vector.RecordEpisodeStatistics(TouchVectorEnv(touch_env))
     env.reset(seed=7)
     touch_env.steps[2] = 5
-    for action in drawn(0):
-        obs, reward, terminated, truncated, told = env.step(action)
-        step = made[-1]
+    for action in random_actions(0):
+        obs, reward, terminated, truncated, infos = env.step(action)
+        step = recorded_steps[-1]
         np.testing.assert_equal(obs, on_host(step.obs))
-        for found, expected in zip((reward, terminated, truncated), step[1:4], strict=True):
-            np.testing.assert_array_equal(found, expected.cpu().numpy())
+        for actual, expected in zip((reward, terminated, truncated), step[1:4], strict=True):
+            np.testing.assert_array_equal(actual, expected.cpu().numpy())
         ended = step.info.ended.cpu().numpy()
-        assert ("_final_obs" in told) == ended.any()
+        assert ("_final_obs" in infos) == ended.any()
         for row in np.flatnonzero(ended):
-            np.testing.assert_equal(told["final_obs"][row], {n: v[row].cpu().numpy() for n, v in step.info.final_obs.items()})
-            final = told["final_info"]
+            np.testing.assert_equal(infos["final_obs"][row], {n: v[row].cpu().numpy() for n, v in step.info.final_obs.items()})
+            final = infos["final_info"]
             for name in ("score", "episode_return", "episode_steps", "faults"):
                 assert final[name][row] == getattr(step.info, name)[row].item()
-            np.testing.assert_allclose(told["episode"]["r"][row], final["episode_return"][row], atol=1e-6)
+            np.testing.assert_allclose(infos["episode"]["r"][row], final["episode_return"][row], atol=1e-6)
             if row != 2:
-                assert told["episode"]["l"][row] == final["episode_steps"][row]
-    assert env.episode_count == sum(int(step.info.ended.sum()) for step in made) == 2 * NUM_ENVS + 1
+                assert infos["episode"]["l"][row] == final["episode_steps"][row]
+    assert env.episode_count == sum(int(step.info.ended.sum()) for step in recorded_steps) == 2 * NUM_ENVS + 1
 
 
 @pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype")
-def test_tensors_are_where_the_environment_is(touch_env, made):
+def test_tensors_stay_on_the_environments_device(touch_env, recorded_steps):
     env = TouchVectorEnv(touch_env, output="torch")
     env.reset(seed=7)
-    actions = torch.from_numpy(np.nan_to_num(drawn(1))).to(touch_env.device)
+    actions = torch.from_numpy(np.nan_to_num(random_actions(1))).to(touch_env.device)
     is_cuda = touch_env.device.type == "cuda"
     if is_cuda:
         torch.cuda.synchronize()
         torch.cuda.set_sync_debug_mode("error")
     try:
-        given = [env.step(action) for action in actions]
+        results = [env.step(action) for action in actions]
     finally:
         if is_cuda:
             torch.cuda.set_sync_debug_mode("default")
-    for (obs, reward, terminated, truncated, told), step in zip(given, made, strict=True):
+    for (obs, reward, terminated, truncated, infos), step in zip(results, recorded_steps, strict=True):
         pairs = [(reward, step.reward), (terminated, step.terminated), (truncated, step.truncated)]
         pairs += [(obs[name], value) for name, value in step.obs.items()]
-        pairs += [(told["final_obs"][name], value) for name, value in step.info.final_obs.items()]
-        pairs += [(told[name], getattr(step.info, name)) for name in STEP_KEYS if name not in ("terms", "episode_terms")]
-        pairs += [(told["_final_obs"], step.info.ended), (told["_score"], ~step.info.ended)]
-        assert all(found.device == touch_env.device and torch.equal(found, expected) for found, expected in pairs)
+        pairs += [(infos["final_obs"][name], value) for name, value in step.info.final_obs.items()]
+        pairs += [(infos[name], getattr(step.info, name)) for name in STEP_KEYS if name not in ("terms", "episode_terms")]
+        pairs += [(infos["_final_obs"], step.info.ended), (infos["_score"], ~step.info.ended)]
+        assert all(actual.device == touch_env.device and torch.equal(actual, expected) for actual, expected in pairs)
 
 
-def test_wrappers_of_actions_and_rewards(touch_env, made):
+def test_wrappers_of_actions_and_rewards(touch_env, recorded_steps):
     env = vector.RescaleAction(TouchVectorEnv(touch_env), np.float32([-2, -2]), np.float32([2, 2]))
     env = vector.NormalizeReward(vector.TransformReward(vector.ClipAction(env), lambda reward: reward - 1), gamma=0.0)
     env.reset(seed=7)
-    for action in np.nan_to_num(drawn(2)):
+    for action in np.nan_to_num(random_actions(2)):
         reward = env.step(2 * action)[1]
         deviation = np.sqrt(env.return_rms.var + env.epsilon)
-        np.testing.assert_allclose(reward, (made[-1].reward.cpu().numpy() - 1) / deviation, rtol=1e-5)
+        np.testing.assert_allclose(reward, (recorded_steps[-1].reward.cpu().numpy() - 1) / deviation, rtol=1e-5)

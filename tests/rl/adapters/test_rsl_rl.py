@@ -1,4 +1,4 @@
-"""The environment of rsl_rl: its runner trains on it, and what it tells is of the episodes that have ended."""
+"""The rsl_rl environment: its runner trains on it, and its log covers finished episodes."""
 
 import importlib
 import json
@@ -20,7 +20,7 @@ NUM_ENVS = 4
 @pytest.fixture(scope="module", params=DEVICES)
 def touch_env(request, tmp_path_factory):
     env = TouchEnv(small_task(tmp_path_factory.mktemp("rsl_rl")), NUM_ENVS, device=request.param)
-    with pytest.warns(UserWarning, match="1 had controls that are not finite"):  # said once, here
+    with pytest.warns(UserWarning, match="1 had controls that are not finite"):  # shown once, here
         have_a_fault(env)
     yield env
     env.close()
@@ -31,7 +31,7 @@ LSTM = {"class_name": "RNNModel", "rnn_type": "lstm", "rnn_hidden_dim": 8, "rnn_
 
 
 def runner_of(env, log_dir=None, groups=("proprio", "tactile_sensors", "goal"), model=MLP):
-    """PPO with small networks, an actor on what a hand has and a critic on what only a simulation knows."""
+    """Return a PPO runner with small networks: a hand's observations for the actor, privileged ones for the critic."""
     network = model | {"hidden_dims": [16], "activation": "elu", "obs_normalization": True}
     actor = network | {"distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 1.0}}
     config = {
@@ -46,8 +46,8 @@ def runner_of(env, log_dir=None, groups=("proprio", "tactile_sensors", "goal"), 
     return OnPolicyRunner(env, config, log_dir=None if log_dir is None else str(log_dir), device=str(env.device))
 
 
-def logged(folder):
-    """Return what TensorBoard's file of a run holds: its values by name."""
+def logged_values(folder):
+    """Return the values in a run's TensorBoard file by name."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(folder))
@@ -56,32 +56,32 @@ def logged(folder):
 
 
 def test_the_runner_trains(touch_env, tmp_path):
-    """Two iterations change the policy, and the log has each iteration's episodes: 4 of 8 steps in 12, then 8 in 12."""
+    """Two iterations change the policy; the log has their episodes: 4 of 8 steps in 12, then 8 in 12."""
     env = TouchVecEnv(touch_env)
     env.reset(seed=1)
     runner = runner_of(env, tmp_path)
-    before = [weight.clone() for weight in runner.alg.get_policy().parameters()]
+    old_weights = [weight.clone() for weight in runner.alg.get_policy().parameters()]
     runner.learn(2)
-    after = list(runner.alg.get_policy().parameters())
-    assert all(not torch.equal(old, new) and new.isfinite().all() for old, new in zip(before, after, strict=True))
-    found = logged(tmp_path)
-    assert found["Episode/steps"] == found["Train/mean_episode_length"] == [STEPS, STEPS]
-    assert found["Episode/fault"] == [0, 0]
-    terms = [sum(found[f"Reward/{name}"][i] for name in touch_env.step(torch.zeros(4, 2)).info.terms) for i in range(2)]
-    assert found["Episode/return"] == pytest.approx(terms, abs=1e-6)
-    assert found["Train/mean_reward"][0] == pytest.approx(found["Episode/return"][0], abs=1e-6)
+    new_weights = list(runner.alg.get_policy().parameters())
+    assert all(not torch.equal(old, new) and new.isfinite().all() for old, new in zip(old_weights, new_weights, strict=True))
+    values = logged_values(tmp_path)
+    assert values["Episode/steps"] == values["Train/mean_episode_length"] == [STEPS, STEPS]
+    assert values["Episode/fault"] == [0, 0]
+    terms = [sum(values[f"Reward/{name}"][i] for name in touch_env.step(torch.zeros(4, 2)).info.terms) for i in range(2)]
+    assert values["Episode/return"] == pytest.approx(terms, abs=1e-6)
+    assert values["Train/mean_reward"][0] == pytest.approx(values["Episode/return"][0], abs=1e-6)
 
 
-def test_recurrent_networks_train_and_forget_episodes_that_have_ended(touch_env):
-    """By rsl_rl's own PPO and its RNNModel: all weights change, those of the memory among them."""
+def test_recurrent_networks_train_and_forget_finished_episodes(touch_env):
+    """With rsl_rl's PPO and RNNModel: all weights change, including those of the memory."""
     env = TouchVecEnv(touch_env)
     env.reset(seed=1)
     runner = runner_of(env, model=LSTM)
-    before = {name: weight.clone() for name, weight in runner.alg.actor.named_parameters()}
+    old_weights = {name: weight.clone() for name, weight in runner.alg.actor.named_parameters()}
     runner.learn(2)
-    after = dict(runner.alg.actor.named_parameters())
-    assert any(name.startswith("rnn.") for name in after)
-    assert all(not torch.equal(before[name], weight) and weight.isfinite().all() for name, weight in after.items())
+    new_weights = dict(runner.alg.actor.named_parameters())
+    assert any(name.startswith("rnn.") for name in new_weights)
+    assert all(not torch.equal(old_weights[name], weight) and weight.isfinite().all() for name, weight in new_weights.items())
     with torch.inference_mode():
         runner.alg.actor(env.get_observations())
         hidden, cell = runner.alg.actor.get_hidden_state()
@@ -93,8 +93,8 @@ def test_recurrent_networks_train_and_forget_episodes_that_have_ended(touch_env)
         assert ((memory.abs().amax(dim=(0, 2)) == 0) == ended).all()
 
 
-def test_the_environment_goes_on_after_training(touch_env):
-    """The runner collects in inference mode; what is remembered can be written outside of it."""
+def test_the_environment_can_be_used_after_training(touch_env):
+    """The runner collects in inference mode, yet the environment's state stays writable outside of it."""
     env = TouchVecEnv(touch_env)
     runner = runner_of(env)
     runner.learn(1, init_at_random_ep_len=True)
@@ -106,14 +106,14 @@ def test_the_environment_goes_on_after_training(touch_env):
 
 @pytest.mark.slow
 def test_training_on_a_task_of_the_hand():
-    """The example of the README: the XHand1 and an object on its palm."""
+    """The README's example: the XHand1 with an object on its palm."""
     env = TouchVecEnv(TouchEnv("examples/tasks/in_palm_rotate.yaml", 2, overrides={"touch": "bool", "placement": "tips"}))
     runner_of(env).learn(1)
     env.close()
 
 
-def test_time_limits_are_told_apart_from_ends_for_good(touch_env):
-    """Environment 1 ends at step 3 by an action that is not finite, the others after 8 steps, 2 three steps earlier."""
+def test_time_outs_are_distinguished_from_terminations(touch_env):
+    """A NaN terminates environment 1 at step 3; the others time out after 8 steps, environment 2 after 5."""
     env = TouchVecEnv(touch_env)
     env.reset(seed=2)
     env.episode_length_buf[2] = 3
@@ -134,11 +134,11 @@ def test_time_limits_are_told_apart_from_ends_for_good(touch_env):
     }
 
 
-def test_the_log_sums_up_the_episodes_that_have_ended(touch_env):
+def test_the_log_covers_finished_episodes(touch_env):
     env = TouchVecEnv(touch_env)
     env.reset(seed=2)
     steps = [env.step(torch.full((NUM_ENVS, 2), 0.3)) for _ in range(STEPS - 1)]
-    touch_env.task.memory["reached"].copy_(torch.arange(NUM_ENVS))  # as if so many goals had been reached
+    touch_env.task.memory["reached"].copy_(torch.arange(NUM_ENVS))  # pretend that many goals were reached
     steps.append(env.step(torch.full((NUM_ENVS, 2), 0.3)))
     log = steps[-1][3]["log"]
     torch.testing.assert_close(log["Episode/return"], torch.stack([reward for _, reward, *_ in steps]).sum(dim=0))
@@ -147,25 +147,25 @@ def test_the_log_sums_up_the_episodes_that_have_ended(touch_env):
     assert log["Episode/score"].tolist() == list(range(NUM_ENVS))
 
 
-def test_observations(touch_env):
-    """Groups as the environment has them; those of an ended episode are the first of the next one."""
+def test_observations_match_the_environments_groups(touch_env):
+    """After the end of an episode they are the first ones of the next."""
     env = TouchVecEnv(touch_env)
     obs, extras = env.reset(seed=3)
     assert isinstance(obs, TensorDict) and extras == {}
     assert (obs.batch_size, {name: value.shape[1] for name, value in obs.items()}) == (torch.Size([NUM_ENVS]), touch_env.groups)
-    kept = obs.clone()
+    copy = obs.clone()
     first = touch_env.reset(3)
-    exact = 0.0 if env.device.type == "cpu" else 1e-4  # physics on a GPU adds up in any order
+    tolerance = 0.0 if env.device.type == "cpu" else 1e-4  # sums on a GPU have no fixed order
     for name, value in obs.items():
-        torch.testing.assert_close(first[name], value, rtol=exact, atol=exact)
+        torch.testing.assert_close(first[name], value, rtol=tolerance, atol=tolerance)
     for _ in range(STEPS):
-        made = env.step(torch.ones(NUM_ENVS, 2))[0]
-        assert env.get_observations() is made
-        assert (obs == kept).all()  # what was handed out stays as it was
-    assert made["proprio"].abs().max() == 0  # at rest, and no action yet
+        next_obs = env.step(torch.ones(NUM_ENVS, 2))[0]
+        assert env.get_observations() is next_obs
+        assert (obs == copy).all()  # not overwritten
+    assert next_obs["proprio"].abs().max() == 0  # at rest, without a last action
 
 
-def test_episode_lengths_are_read_and_written_whole_and_in_part(touch_env):
+def test_episode_lengths_can_be_read_and_written(touch_env):
     env = TouchVecEnv(touch_env)
     env.reset()
     assert env.max_episode_length == STEPS
@@ -176,7 +176,7 @@ def test_episode_lengths_are_read_and_written_whole_and_in_part(touch_env):
     assert env.episode_length_buf.tolist() == [3, 2, 1, 0]
 
 
-def test_what_the_runner_reads(touch_env):
+def test_attributes_that_the_runner_reads(touch_env):
     env = TouchVecEnv(touch_env)
     assert (env.num_envs, env.num_actions, env.device) == (NUM_ENVS, 2, touch_env.device)
     assert json.loads(json.dumps(env.cfg))["task"] == "in_palm_rotate"

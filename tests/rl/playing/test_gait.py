@@ -1,4 +1,4 @@
-"""Gaits: shares and percentiles of instants that are made up, worked out by hand."""
+"""Gaits: shares and percentiles of made-up instants, against values worked out by hand."""
 
 import json
 from dataclasses import asdict
@@ -18,14 +18,14 @@ HAND = """<mujoco><worldbody>
 
 
 def meter_of(num, blocks=1, limit=(2.0, np.inf), rated=(4.0, np.inf), links=("palm", "tip")):
-    own = SimpleNamespace(names=("bend", "turn"), limit=np.array(limit), top_speed=np.array(rated))
-    setup = SimpleNamespace(model=mujoco.MjModel.from_xml_string(HAND), links=links, actuators=own)
+    actuators = SimpleNamespace(names=("bend", "turn"), limit=np.array(limit), top_speed=np.array(rated))
+    setup = SimpleNamespace(model=mujoco.MjModel.from_xml_string(HAND), links=links, actuators=actuators)
     env = SimpleNamespace(num_envs=num, task=SimpleNamespace(setup=setup), sim=SimpleNamespace(qpos=torch.zeros(num, 1)))
     return GaitMeter(env, blocks)
 
 
 def instant(tip, torque=0.0, palm=0.2, depth=0.0, spin=1.0, joint_vel=0.0, probes=2):
-    """Return an instant; of each argument one number per environment."""
+    """Return an instant; each argument is one number per environment."""
     tip = torch.as_tensor(tip, dtype=torch.float64)
     num, zero = len(tip), torch.zeros(len(tip), dtype=torch.float64)
     full = lambda value: zero + torch.as_tensor(value, dtype=torch.float64)  # noqa: E731
@@ -48,43 +48,43 @@ def add(meter, now, progress, counts=None, strength=0.98):
     meter.add_instant(now, progress, torch.full((num, 2), strength), counts)
 
 
-def test_shares_are_those_of_hand_worked_instants():
-    """Progress 0.3 held, 0.1 and 0.2 coasting, and −0.5 that does not count: a half; at the limit at 2 of 4 instants."""
+def test_shares_match_hand_worked_instants():
+    """Progress is 0.3 held and 0.3 coasting, −0.5 does not count: one half; torque is at its limit in 2 of 4 instants."""
     meter = meter_of(2)
     add(meter, instant([1.0, 0.0], torque=[1.97, -2.0]), [0.3, 0.1])
     add(meter, instant([0.005, 3.0], torque=[1.9, 0.0]), [0.2, -0.5])
-    add(meter, instant([0.0, 0.0], torque=[2.0, 2.0], spin=99.0), [9.0, 9.0], counts=[False, False])  # counts for nothing
-    found = meter.gaits()[0]
-    assert found.coasting == pytest.approx(0.3 / 0.6) and found.untouched == 0.5
-    assert found.saturation == found.any_saturation == 0.5 and found.saturations == {"bend": 0.5}  # the other has no limit
-    assert (found.max_spin, found.max_speed) == (1.0, 0.5)
-    assert list(found.link_forces) == ["palm", "tip"] and found.rated_speeds == {"bend": 4.0}
-    json.dumps(asdict(found), allow_nan=False)
+    add(meter, instant([0.0, 0.0], torque=[2.0, 2.0], spin=99.0), [9.0, 9.0], counts=[False, False])  # not counted
+    gait = meter.gaits()[0]
+    assert gait.coasting == pytest.approx(0.3 / 0.6) and gait.untouched == 0.5
+    assert gait.saturation == gait.any_saturation == 0.5 and gait.saturations == {"bend": 0.5}  # the other joint has no limit
+    assert (gait.max_spin, gait.max_speed) == (1.0, 0.5)
+    assert list(gait.link_forces) == ["palm", "tip"] and gait.rated_speeds == {"bend": 4.0}
+    json.dumps(asdict(gait), allow_nan=False)
 
 
-def test_a_weaker_drive_is_at_its_limit_earlier():
+def test_a_weaker_drive_reaches_its_limit_earlier():
     meter = meter_of(1)
     add(meter, instant([1.0], torque=[1.5]), [0.1])
     add(meter, instant([1.0], torque=[1.5]), [0.1], strength=0.7)
     assert meter.gaits()[0].saturation == 0.5
 
 
-def test_percentiles_are_those_of_all_values():
-    """Of 1 to 400 N at the fingertip the 396th, within a bin; depths that are no contact do not count."""
+def test_percentiles_cover_all_values():
+    """Of 1 to 400 N the 396th, within a bin; depths without contact do not count."""
     num = 400
     values = np.arange(1.0, num + 1)
     meter = meter_of(num)
     depth = np.where(values > 200, 1e-5 * values, -1e-3)
     add(meter, instant(values, palm=0.0, depth=depth, spin=0.1 * values, joint_vel=-0.01 * values), values.tolist())
-    found = meter.gaits()[0]
-    assert found.force == found.link_forces["tip"] == pytest.approx(396, rel=0.006) and list(found.link_forces) == ["tip"]
-    assert found.penetration == pytest.approx(398e-5, rel=0.006)
-    assert found.spin == pytest.approx(39.6, rel=0.006) and found.speed == pytest.approx(19.8, rel=0.006)
-    assert found.joint_speed == pytest.approx(3.96 / 4.0, rel=0.006) and found.joint_speeds["turn"] == 0.0
-    assert found.coasting == 0.0 and "force on links, 99 % below                     396 N" in str(found)
+    gait = meter.gaits()[0]
+    assert gait.force == gait.link_forces["tip"] == pytest.approx(396, rel=0.006) and list(gait.link_forces) == ["tip"]
+    assert gait.penetration == pytest.approx(398e-5, rel=0.006)
+    assert gait.spin == pytest.approx(39.6, rel=0.006) and gait.speed == pytest.approx(19.8, rel=0.006)
+    assert gait.joint_speed == pytest.approx(3.96 / 4.0, rel=0.006) and gait.joint_speeds["turn"] == 0.0
+    assert gait.coasting == 0.0 and "force on links, 99 % below                     396 N" in str(gait)
 
 
-def test_blocks_are_apart():
+def test_blocks_are_measured_separately():
     meter = meter_of(4, blocks=2)
     add(meter, instant([0.0, 1.0, 2.0, 2.0], spin=[1.0, 2.0, 3.0, 4.0]), [0.1, 0.3, 0.1, 0.1])
     one, two = meter.gaits()
@@ -93,15 +93,15 @@ def test_blocks_are_apart():
     assert (one.force, two.force) == (pytest.approx(1.0, rel=0.006), pytest.approx(2.0, rel=0.006))
 
 
-def test_what_a_task_does_not_have_is_none():
+def test_quantities_that_a_task_lacks_are_none():
     meter = meter_of(1, limit=(np.inf, np.inf), rated=(np.inf, np.inf), links=())
     now = instant([0.0], probes=0)
     now.link_force = now.link_force[:, :0]
     add(meter, now, None)
-    found = meter.gaits()[0]
+    gait = meter.gaits()[0]
     for name in ("coasting", "untouched", "saturation", "any_saturation", "penetration", "force", "joint_speed"):
-        assert getattr(found, name) is None, name
-    assert "–" in str(found)
+        assert getattr(gait, name) is None, name
+    assert "–" in str(gait)
     assert meter_of(1).gaits()[0].untouched is None  # without an instant
 
 

@@ -1,4 +1,4 @@
-"""The policies of the repository: small enough, they fit their tasks, and they do there what their cards say."""
+"""The repository's policies: small, fitting their tasks, and as good as their cards claim."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from tgdsl.rl.start import moved_joints
 REPOSITORY = Path(__file__).parents[3]
 POLICIES = sorted((REPOSITORY / "policies").glob("*.pt"))
 CAPPED = "physics.iterations: null, now 10"
-"""Policies of the palm were learned before their tasks had a cap that hardly ever acts: docs/background/hands.md."""
+"""The palm's policies predate their tasks' cap, which is rarely reached: docs/background/hands.md."""
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 SAYS = {
     *("groups", "joints", "iterations", "samples", "minutes", "command", "score", "task", "overrides", "seed", "device"),
@@ -24,7 +24,7 @@ PER_TAXEL = {"none": 0, "bool": 1, "depth": 1, "force_taxel": 3, "force": 3, "pr
 
 
 def taxels_of(document, touch, resolution, placement):
-    """Return the module of a task's taxels, the link of each, and the joints that its policies move."""
+    """Return the touch module, the link of each taxel, and the moved joints of a task."""
     loaded = load_task(document, {"touch": touch, "resolution": resolution, "placement": placement})
     sensed = compile_sensed(loaded, "cpu")
     links = [link for felt in sensed.groups.values() for link in felt.layout.link_id.tolist()]
@@ -32,8 +32,8 @@ def taxels_of(document, touch, resolution, placement):
 
 
 @pytest.mark.parametrize("file", POLICIES, ids=lambda file: file.stem)
-def test_its_card_is_complete(file):
-    """Its network takes the sizes on its card, and its card names no folder of the machine that trained it."""
+def test_the_card_is_complete(file):
+    """The network takes the sizes on its card, which names no folder of the training machine."""
     assert file.stat().st_size <= 2.5 * 2**20
     saved = read_policy(file)
     card = saved.card
@@ -47,7 +47,7 @@ def test_its_card_is_complete(file):
 
 @pytest.mark.parametrize("name", ["find_ridge", "grip_force_agg_force", "in_palm_rotate_cube"])
 def test_policies_of_the_wheel_fit_their_tasks(name):
-    """Joints, taxels and sizes of groups are those of the task; `test_it_does_better_than_rest` checks the other policies."""
+    """Joints, taxels and sizes of groups match; `test_a_policy_does_better_than_rest` checks the other policies."""
     saved = read_policy(REPOSITORY / "policies" / f"{name}.pt")
     card = saved.card
     spec = load_task(REPOSITORY / card["task"], card["overrides"]).spec
@@ -60,11 +60,11 @@ def test_policies_of_the_wheel_fit_their_tasks(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("file", POLICIES, ids=lambda file: file.stem)
-def test_it_does_better_than_rest(file):
-    """Within two seconds in four environments, on MuJoCo; others within five, in sum.
+def test_a_policy_does_better_than_rest(file):
+    """Usually in each of four environments within two seconds on MuJoCo.
 
-    These are a student, of eight environments, and what brings objects to orientations, of sixteen: some lose theirs.
-    What rests feels nothing, which changes nothing of its episodes.
+    Students (eight environments) and reorientation (sixteen) may lose some objects: their sum counts, over five seconds.
+    The resting environments compute no touch, which does not change their episodes.
     """
     saved = read_policy(file)
     card = saved.card
@@ -73,7 +73,7 @@ def test_it_does_better_than_rest(file):
     env = TouchEnv(REPOSITORY / card["task"], num, threads=1, overrides=card["overrides"])
     policy, obs = policy_for(env, saved), env.reset(seed=1)
     assert set(policy.changes) <= {CAPPED}
-    steps = env.max_steps - 1  # after the last one of an episode the score is that of the next
+    steps = env.max_steps - 1  # after an episode's last step the score is the next one's
     steps = min(steps, round((5.0 if is_long else 2.0) / env.control_step))
     returns = torch.zeros(num)
     for _ in range(steps):
@@ -88,5 +88,5 @@ def test_it_does_better_than_rest(file):
     rest.close()
 
 
-def test_together_they_are_small():
+def test_all_policies_together_are_small():
     assert 0 < sum(file.stat().st_size for file in POLICIES) < 20e6

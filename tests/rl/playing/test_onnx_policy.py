@@ -1,4 +1,4 @@
-"""Policies as ONNX files: ONNX Runtime returns what torch does, to 1e-5, for any number of environments."""
+"""Policies as ONNX files: ONNX Runtime agrees with torch to 1e-5 for any number of environments."""
 
 import json
 
@@ -28,10 +28,10 @@ def session_of(file):
     return session, session.get_modelmeta().custom_metadata_map
 
 
-def test_a_teacher_returns_the_actions_of_its_torchscript(tmp_path):
+def test_a_teachers_onnx_equals_its_torchscript(tmp_path):
     learner, loaded = small_learner(tmp_path, train__actor="[tactile_sensors, proprio]")
     for _ in range(2):
-        learner.iterate()  # observations are normalised by what was seen
+        learner.iterate()  # updates the normalisation
     card = learner.card(run_origin(loaded, learner.env, 0, {}, 1), 0.0, "tgdsl train task.yaml")
     learner.write_policy(card, tmp_path / "policy.pt")
     saved = read_policy(tmp_path / "policy.pt")
@@ -56,14 +56,14 @@ def test_a_student_with_every_encoder_carries_its_memory_from_step_to_step(tmp_p
     assert [port.name for port in session.get_inputs()] == ["obs", "memory"]
     for num in BATCHES:
         memory = torch.zeros((num, student.memory))
-        carried = memory.numpy().copy()
+        onnx_memory = memory.numpy().copy()
         for step in range(20):
             x = torch.randn((num, 45))
             with torch.no_grad():
                 expected, _, memory = student(x, memory)
-            actions, carried = session.run(None, {"obs": x.numpy(), "memory": carried})
+            actions, onnx_memory = session.run(None, {"obs": x.numpy(), "memory": onnx_memory})
             np.testing.assert_allclose(actions, expected, atol=1e-5)
-            np.testing.assert_allclose(carried, memory, atol=1e-5)
-            if step == 9:  # the first environment begins an episode
-                carried = carried.copy()
-                memory[0], carried[0] = 0.0, 0.0
+            np.testing.assert_allclose(onnx_memory, memory, atol=1e-5)
+            if step == 9:  # an episode begins in the first environment
+                onnx_memory = onnx_memory.copy()
+                memory[0], onnx_memory[0] = 0.0, 0.0

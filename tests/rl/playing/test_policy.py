@@ -1,4 +1,4 @@
-"""A learned policy in a TorchScript file: it acts as the network did, and one of other sizes is refused by name."""
+"""A learned policy in a TorchScript file: it acts like the exported network; mismatched sizes are refused by name."""
 
 import pytest
 import torch
@@ -11,8 +11,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 GROUPS = {"proprio": 6, "goal": 7}
 
 
-def exported(model, file):
-    """Write a model as rsl_rl's `export_policy_to_jit` does."""
+def export(model, file):
+    """Write a model as rsl_rl's `export_policy_to_jit` does; return the file."""
     torch.jit.script(model.as_jit().cpu()).save(str(file))
     return file
 
@@ -24,20 +24,20 @@ def network(kind=MLPModel, num_actions=2, num_envs=3, **more):
     return model.eval(), obs
 
 
-def test_it_acts_as_the_network_that_was_exported(tmp_path):
-    """With normalised observations and a distribution, of which an exported policy returns the mean."""
+def test_a_policy_acts_like_the_exported_network(tmp_path):
+    """With normalised observations; an exported policy returns the mean of its distribution."""
     model, obs = network(obs_normalization=True, distribution_cfg={"class_name": "GaussianDistribution"})
     model.obs_normalizer._mean.fill_(0.3)
-    policy = Policy(read_policy(exported(model, tmp_path / "policy.pt")), GROUPS, 3, 2)
+    policy = Policy(read_policy(export(model, tmp_path / "policy.pt")), GROUPS, 3, 2)
     action = policy({**obs, "priv_obj_state": torch.zeros(3, 15)})
     torch.testing.assert_close(action, model(obs).detach())
     assert not action.requires_grad
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
-def test_it_is_taken_whatever_torchs_default_dtype_is(tmp_path, dtype):
+def test_a_policy_does_not_depend_on_torchs_default_dtype(tmp_path, dtype):
     model, obs = network()
-    saved = read_policy(exported(model, tmp_path / "policy.pt"))
+    saved = read_policy(export(model, tmp_path / "policy.pt"))
     torch.set_default_dtype(dtype)
     try:
         action = Policy(saved, GROUPS, 3, 2)(dict(obs))
@@ -46,8 +46,8 @@ def test_it_is_taken_whatever_torchs_default_dtype_is(tmp_path, dtype):
     torch.testing.assert_close(action, model(obs).detach())
 
 
-def test_how_close_plain_values_are():
-    """All of their parts, numbers but for rounding."""
+def test_plain_values_are_compared_up_to_rounding():
+    """All parts must be present; numbers may differ by rounding."""
     one = {"a": [1.0, {"b": 0.7 * 0.01}], "c": "x"}
     assert is_close(one, {"c": "x", "a": (1.0, {"b": 7 * 0.001})})
     for other in (
@@ -59,11 +59,11 @@ def test_how_close_plain_values_are():
         assert not is_close(one, other) and not is_close(other, one)
 
 
-def test_weights_that_are_stored_in_half_precision_are_float32(tmp_path):
-    """As rounded; what normalises is not rounded."""
+def test_half_precision_weights_are_loaded_as_float32(tmp_path):
+    """Weights are rounded; the normalisation is not."""
     model, obs = network(obs_normalization=True)
     model.obs_normalizer._mean.fill_(0.3)
-    module = torch.jit.load(exported(model, tmp_path / "policy.pt"))
+    module = torch.jit.load(export(model, tmp_path / "policy.pt"))
     for weight in module.parameters():
         weight.data = weight.data.half()
     torch.jit.save(module, tmp_path / "policy.pt")
@@ -74,9 +74,9 @@ def test_weights_that_are_stored_in_half_precision_are_float32(tmp_path):
     torch.testing.assert_close(Policy(saved, GROUPS, 3, 2)(dict(obs)), model(obs).detach())
 
 
-def test_a_recurrent_one_forgets_at_the_end_of_its_episode(tmp_path):
+def test_a_recurrent_policy_forgets_at_the_end_of_an_episode(tmp_path):
     model, obs = network(RNNModel, num_envs=1, rnn_type="gru", rnn_hidden_dim=4, rnn_num_layers=1)
-    policy = Policy(read_policy(exported(model, tmp_path / "policy.pt")), GROUPS, 1, 2)
+    policy = Policy(read_policy(export(model, tmp_path / "policy.pt")), GROUPS, 1, 2)
     obs = dict(obs)
     first, second = policy(obs), policy(obs)
     assert not torch.equal(first, second)
@@ -90,7 +90,7 @@ def test_a_recurrent_one_forgets_at_the_end_of_its_episode(tmp_path):
         Policy(read_policy(tmp_path / "policy.pt"), GROUPS, 3, 2)
 
 
-def test_groups_are_named_or_those_of_a_hand_that_there_are():
+def test_groups_default_to_those_of_a_hand():
     groups = {"priv_proprio": 9, "goal": 7, "proprio": 6}
     assert actor_groups(groups) == ("proprio", "goal")
     assert actor_groups(groups, ("goal", "priv_proprio")) == ("goal", "priv_proprio")
@@ -98,9 +98,9 @@ def test_groups_are_named_or_those_of_a_hand_that_there_are():
         actor_groups(groups, ("gaol",))
 
 
-def test_policies_that_do_not_fit(tmp_path):
+def test_mismatched_policies_are_refused(tmp_path):
     model, _ = network()
-    file = exported(model, tmp_path / "policy.pt")
+    file = export(model, tmp_path / "policy.pt")
     cases = {
         (("proprio", "goal"), 3): "this policy returns actions (3, 2), expected (3, 3): joints are others",
         (("goal",), 2): "this policy takes 13 numbers, not goal (7) = 7; name its groups, in its order",
@@ -111,7 +111,7 @@ def test_policies_that_do_not_fit(tmp_path):
         assert str(raised.value) == f"{file}: {message}"
 
 
-def test_modules_that_are_no_policies(tmp_path):
+def test_modules_that_are_no_policies_are_refused(tmp_path):
     class Two(torch.nn.Module):
         def forward(self, first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
             return first + second
@@ -127,20 +127,20 @@ def test_modules_that_are_no_policies(tmp_path):
             Policy(read_policy(tmp_path / "module.pt"), GROUPS, 3, 2)
 
 
-def test_files_that_cannot_be_read(tmp_path):
+def test_unreadable_files_are_reported(tmp_path):
     with pytest.raises(PolicyError) as raised:
         Policy(read_policy(tmp_path / "none.pt"), GROUPS, 3, 2)
     assert str(raised.value) == f"{tmp_path}/none.pt: cannot read this file: No such file or directory"
-    torch.save({"actor_state_dict": {}}, tmp_path / "model_0.pt")  # what the runner keeps: no policy by itself
+    torch.save({"actor_state_dict": {}}, tmp_path / "model_0.pt")  # the runner's checkpoint, not a policy
     for name in ("text.pt", "policy.onnx"):
         (tmp_path / name).write_text("no module")
-    what = {
+    contents = {
         "model_0.pt": "a checkpoint, from which learning goes on; the policy of a run is its policy.pt",
         "text.pt": r"no TorchScript file, as rsl_rl's `export_policy_to_jit` writes it$",
         "policy.onnx": "the ONNX form of a policy, expected the policy.pt beside it",
     }
-    for name, this in what.items():
-        with pytest.raises(PolicyError, match=rf"{name}: this is {this}"):
+    for name, content in contents.items():
+        with pytest.raises(PolicyError, match=rf"{name}: this is {content}"):
             read_policy(tmp_path / name)
     with pytest.raises(PolicyError, match=rf"{tmp_path}/policy\.pt: cannot read this file: No such file"):
         read_policy(tmp_path)

@@ -1,4 +1,4 @@
-"""What a policy was learned among: what of sensors' document and scene is otherwise is told, and nothing else."""
+"""Provenance of policies: changes of the sensors' document and the scene are reported, and nothing else."""
 
 import json
 
@@ -28,7 +28,7 @@ IN_SCENE = [
 
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory):
-    """The file of a policy of the small task."""
+    """Return the file of a policy for the small task."""
     folder = tmp_path_factory.mktemp("learned")
     return teacher(folder / "policy.pt", load_task(small_tasks.small_task(folder)), ["proprio"])
 
@@ -41,30 +41,30 @@ def changes(learned, folder):
         env.close()
 
 
-def test_what_is_as_it_was_is_not_told(learned, tmp_path):
-    """In another folder; and of a card that says nothing of it."""
+def test_an_unchanged_task_reports_no_changes(learned, tmp_path):
+    """Also in another folder, and for a card without provenance."""
     assert changes(learned, tmp_path) == []
     loaded = load_task(small_tasks.small_task(tmp_path))
     assert changes_around({}, loaded, mujoco.MjModel.from_xml_string(small_tasks.SCENE)) == []
 
 
-def test_what_of_the_sensors_is_otherwise(learned, tmp_path, monkeypatch):
+def test_changed_sensors_are_reported(learned, tmp_path, monkeypatch):
     text = small_tasks.SENSORS.replace("threshold: 0.1 mm", "rate: 20 Hz, threshold: 0.2 mm").replace("10 cm", "11 cm")
-    text += "  more: {kind: contact_depth, links: tip, feels: [item]}\n"  # which nobody had
+    text += "  more: {kind: contact_depth, links: tip, feels: [item]}\n"  # a sensor that no policy used
     monkeypatch.setattr(small_tasks, "SENSORS", text)
-    found = ["bit.rate: null, now 20.0", "bit.threshold: 0.0001, now 0.0002", "gap.max_range: 0.1, now 0.11"]
-    assert sorted(changes(learned, tmp_path)) == [f"sensors.yaml: sensors.{line}" for line in found]
+    lines = ["bit.rate: null, now 20.0", "bit.threshold: 0.0001, now 0.0002", "gap.max_range: 0.1, now 0.11"]
+    assert sorted(changes(learned, tmp_path)) == [f"sensors.yaml: sensors.{line}" for line in lines]
 
 
 @pytest.mark.parametrize(("part", "before", "now"), IN_SCENE)
-def test_what_of_the_scene_is_otherwise(learned, tmp_path, monkeypatch, part, before, now):
+def test_changes_of_the_scene_are_reported(learned, tmp_path, monkeypatch, part, before, now):
     monkeypatch.setattr(small_tasks, "SCENE", small_tasks.SCENE.replace(before, now))
     assert small_tasks.SCENE.count(now) == 1
     assert changes(learned, tmp_path) == [f"the scene's {part}"]
 
 
 def test_rounding_is_no_difference(tmp_path):
-    """Of each array of floats every number a few units in its last place greater; one number that is 1 % and 0.001 greater is another scene."""
+    """All floats may be a few units in the last place larger; one number 1 % and 0.001 larger is reported."""
     loaded = load_task(small_tasks.small_task(tmp_path))
     model = mujoco.MjModel.from_xml_string(small_tasks.SCENE)
     card = json.loads(json.dumps(provenance(loaded, model)))
@@ -77,7 +77,7 @@ def test_rounding_is_no_difference(tmp_path):
         for name in names:
             array = model.opt.gravity if name == "opt.gravity" else getattr(model, name)
             if array.dtype == np.float64 and array.size:
-                kept = array.copy()
+                original = array.copy()
                 array.flat[0] = array.flat[0] * 1.01 + 1e-3
                 assert changes_around(card, loaded, model) == [f"the scene's {part}"], name
-                array[...] = kept
+                array[...] = original

@@ -1,4 +1,4 @@
-"""What is required of a policy: how it is written, when it is met, and what is refused."""
+"""Requirements of policies: syntax, evaluation and errors."""
 
 from types import SimpleNamespace
 
@@ -8,13 +8,13 @@ from tgdsl.errors import TgdslError
 from tgdsl.rl.playing.evaluation import parse_requirements
 
 
-def found(**gait):
+def evaluation(**gait):
     return SimpleNamespace(
         score=8.0, held=0.96, gait=SimpleNamespace(**{"coasting": 0.1, "penetration": 0.002, "force": None} | gait)
     )
 
 
-def test_units_and_signs():
+def test_units_and_signs_are_parsed():
     parts = parse_requirements("coasting<10 %, penetration <= 2 mm,held>=95%, spin<7 rad/s, force>1")
     assert [(part.name, part.sign) for part in parts] == [
         ("coasting", "<"), ("penetration", "<="), ("held", ">="), ("spin", "<"), ("force", ">"),
@@ -30,14 +30,14 @@ def test_units_and_signs():
     ],
 )  # fmt: skip
 def test_a_bound_is_met_or_not(text, is_met):
-    (one,) = parse_requirements(text)
-    assert (one.failure(found()) is None) == is_met
+    (requirement,) = parse_requirements(text)
+    assert (requirement.failure(evaluation()) is None) == is_met
 
 
-def test_a_failure_says_what_was_found():
-    one, two = parse_requirements("penetration<1 mm, force<10 N")
-    assert one.failure(found()) == "not met: penetration<1 mm: found 0.002 m"
-    assert two.failure(found()).startswith("not met: force<10 N: it was not measured")
+def test_a_failure_shows_the_measured_value():
+    penetration, force = parse_requirements("penetration<1 mm, force<10 N")
+    assert penetration.failure(evaluation()) == "not met: penetration<1 mm: found 0.002 m"
+    assert force.failure(evaluation()).startswith("not met: force<10 N: it was not measured")
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_a_failure_says_what_was_found():
         ("score<nan", "is not a quantity"),
     ],
 )  # fmt: skip
-def test_what_is_no_requirement_is_refused(text, why):
+def test_invalid_requirements_are_refused(text, why):
     with pytest.raises(TgdslError) as error:
         parse_requirements(text)
     assert "--require" in str(error.value) and why in str(error.value)

@@ -1,4 +1,4 @@
-"""Holding an object as hard as commanded: rewards against the reference, what pays, starts, commands, ends."""
+"""Holding an object with a commanded force: rewards against the reference, incentives, starts, commands, terminations."""
 
 import sys
 from dataclasses import replace
@@ -23,7 +23,7 @@ DOCUMENT = FOLDER / "grip_force.yaml"
 NUM = 8
 """As many environments as the object has variants."""
 PLAIN = {"touch": "none", "randomise.drive": {}, "randomise.push": {}}
-"""Ideal drives, and no pushes."""
+"""Ideal drives and no pushes."""
 GRAVITY = 9.81
 
 
@@ -35,9 +35,9 @@ def grip(num_envs=NUM, **overrides):
 @pytest.fixture(scope="module")
 def env():
     """Eight objects, ideal drives, no pushes."""
-    envs = grip()
-    yield envs
-    envs.close()
+    environments = grip()
+    yield environments
+    environments.close()
 
 
 def still(env):
@@ -50,7 +50,7 @@ def random_actions(env, num, seed=0):
 
 
 def force_of(result):
-    """Return the sum of normal forces after a step, that of the end of an episode included [N]."""
+    """Return the sum of normal forces after a step, also at the end of an episode [N]."""
     return result.info.final_obs["priv_force"][:, 0].double()
 
 
@@ -58,8 +58,8 @@ def command(env):
     return {"command": env.task.command.double().numpy().copy()}
 
 
-def by_command(spec, record, dt):
-    """The reference, told when commands were new by their change."""
+def reference_of(spec, record, dt):
+    """Return the reference's terms, where a change of the command marks a new one."""
     return grip_force(spec, {**record, "is_new": np.diff(record["command"], prepend=0.0) != 0}, dt)
 
 
@@ -69,16 +69,16 @@ ODD = {
     "randomise.push": {"z": ["-4 N", "-4 N"], "interval": ["0.2 s", "0.3 s"]},
     "rewards": {name: 1.5 * value for name, value in GripForce.Rewards()},
 }  # fmt: skip
-"""Other numbers than the document's, and enough going on that every term is seen."""
+"""Numbers unlike the document's, chosen so that every term occurs."""
 
 
 def assert_started(env, force):
-    """Each object is where its keyframe has it, and the drives' lag is the keyframe's, times the command over its force."""
-    for i, (pos, target, wanted) in enumerate(zip(env.sim.qpos, env.actuation.target, env.task.command, strict=True)):
+    """Assert that objects are at their keyframes and the drives' lag is scaled by command over keyframe force."""
+    for i, (pos, target, commanded) in enumerate(zip(env.sim.qpos, env.actuation.target, env.task.command, strict=True)):
         key = env.sim.model.key(f"hold-{i}")
         np.testing.assert_allclose(pos, key.qpos, atol=1e-12)
         lag = (key.ctrl - key.qpos[: len(key.ctrl)])[env.task.setup.actuators.actuator]
-        np.testing.assert_allclose(target - pos[: len(target)], float(wanted) / force * lag, atol=1e-12)
+        np.testing.assert_allclose(target - pos[: len(target)], float(commanded) / force * lag, atol=1e-12)
 
 
 def test_episodes_begin_with_keyframes(env):
@@ -93,24 +93,24 @@ def test_rewards_ends_and_scores_equal_the_reference():
     for i, action in enumerate(random_actions(env, 60)):
         recorder.step(torch.ones_like(action) if i % 30 > 20 else action)
     assert sum(len(episodes) for episodes in recorder.episodes) > 2 * NUM
-    seen = assert_reference(recorder, by_command)
-    # The end of a joint's range is nowhere near.
+    seen = assert_reference(recorder, reference_of)
+    # Joints stay far from the ends of their ranges.
     assert seen == {*GripForce.Rewards.model_fields, "is_over", "score"} - {"joint_limit"}
     env.close()
 
 
 @pytest.mark.slow
-def test_the_document_as_it_is_equals_the_reference():
+def test_the_unchanged_document_equals_the_reference():
     env = TouchEnv(DOCUMENT, NUM, threads=1)
     recorder = Recorder(env, lambda now: command(env))
     for action in random_actions(env, 150):
         recorder.step(action)
-    assert {"force_near", "force_far", "object_angle", "action_rate", "work"} <= assert_reference(recorder, by_command)
+    assert {"force_near", "force_far", "object_angle", "action_rate", "work"} <= assert_reference(recorder, reference_of)
     env.close()
 
 
 def test_a_joint_at_the_end_of_its_range_costs(env):
-    """0.05 rad beyond the middle 95 % of a range."""
+    """The joint is 0.05 rad beyond the middle 95 % of its range."""
     env.reset(0)
     now, (low, high) = env.now, (env.task.setup.low, env.task.setup.high)
     pos = now.joint_pos.clone()
@@ -119,8 +119,8 @@ def test_a_joint_at_the_end_of_its_range_costs(env):
     torch.testing.assert_close(terms["joint_limit"], torch.full((NUM,), -40 * 0.05).double())
 
 
-def scripted(env, share):
-    """Return what the terms of force pay where a script says that forces are a share of the command [1/s]."""
+def force_reward(env, share):
+    """Return the reward of the force terms when forces are a share of the command [1/s]."""
     now = env.now
     force = torch.zeros_like(now.normal_force)
     force[:, :2] = (0.5 * share * env.task.command)[:, None]
@@ -130,10 +130,10 @@ def scripted(env, share):
     return terms["force_near"] + terms["force_far"]
 
 
-def test_the_right_force_beats_half_of_it_and_twice_it(env):
-    """And it pays less the further it is from the command, either way; nothing pays for no force at all."""
+def test_the_commanded_force_pays_most(env):
+    """The reward falls with distance from the command on both sides, and no force earns nothing."""
     env.reset(0)
-    none, half, less, right, more, twice, thrice = (scripted(env, share) for share in (0, 0.5, 0.9, 1.0, 1.1, 2.0, 3.0))
+    none, half, less, right, more, twice, thrice = (force_reward(env, share) for share in (0, 0.5, 0.9, 1.0, 1.1, 2.0, 3.0))
     torch.testing.assert_close(right, torch.full_like(right, 3.0))
     assert (right > less).all() and (less > half).all() and (half > none).all()
     assert (right > more).all() and (more > twice).all() and (none < 1e-9).all() and (twice < 1e-9).all()
@@ -141,38 +141,38 @@ def test_the_right_force_beats_half_of_it_and_twice_it(env):
 
 
 def press(env, share):
-    """Have the drives press with a share of the command, as far as the start's targets tell: w of the module's page."""
+    """Make the drives press with a share of the command, by the lag of the start's targets."""
     task = env.task
     lag = (share * task.command / task.spec.start_force)[:, None] * task.lag
     env.actuation.target.copy_(task.held + lag)
 
 
-def held_at(env, wanted, steps):
-    """Press until the sum of normal forces is what is wanted [N], with an integral script; yield each step."""
-    share = wanted / env.task.command
+def regulated_steps(env, force, steps):
+    """Regulate the sum of normal forces to a target by an integral controller; yield each step [N]."""
+    share = force / env.task.command
     for _ in range(steps):
         press(env, share)
         result = env.step(still(env))
         yield result
-        share = share + 0.2 * (wanted - force_of(result)) / env.task.command
+        share = share + 0.2 * (force - force_of(result)) / env.task.command
 
 
-def test_pressing_as_hard_as_commanded_beats_half_and_twice(env):
-    """In physics, for every object: 50 g, which half the force still holds, and a command of 3 N that stays."""
-    paid = {}
+def test_pressing_as_commanded_beats_half_and_twice_the_force(env):
+    """In physics, for every object: at 50 g half the force still holds it; the command stays at 3 N."""
+    rewards = {}
     for share in (0.5, 1.0, 2.0):
         env.reset(0)
         env.task.command.fill_(3.0)
         env.sim.properties.set(mass={"item": 0.05}, friction={"item": 1.0})
-        result = list(held_at(env, torch.full((NUM,), 3.0 * share).double(), 40))
-        assert not any(step.info.ended.any() for step in result)
-        assert ((force_of(result[-1]) / 3.0 / share - 1).abs() < 0.05).all()
-        paid[share] = sum(step.reward for step in result[20:])
-    assert (paid[1.0] > paid[0.5]).all() and (paid[1.0] > paid[2.0]).all()
+        results = list(regulated_steps(env, torch.full((NUM,), 3.0 * share).double(), 40))
+        assert not any(step.info.ended.any() for step in results)
+        assert ((force_of(results[-1]) / 3.0 / share - 1).abs() < 0.05).all()
+        rewards[share] = sum(step.reward for step in results[20:])
+    assert (rewards[1.0] > rewards[0.5]).all() and (rewards[1.0] > rewards[2.0]).all()
 
 
-def test_force_taxel_weighs_the_mass():
-    """At rest the taxels of thumb and fingers carry the weight, to 1 %, and nothing of the objects' force is missed."""
+def test_force_taxels_carry_the_weight():
+    """At rest the taxels of thumb and fingers carry the weight to 1 %, so no contact force is missed."""
     env = grip(touch="force_taxel", resolution="low", force=["7 N", "7 N"], randomise__friction=[1.5, 1.5])
     for _ in range(20):
         env.step(still(env))
@@ -190,12 +190,12 @@ def test_force_taxel_weighs_the_mass():
     weight = env.now.mass * GRAVITY
     assert env.now.mass.min() >= 0.02 and env.now.mass.max() <= 0.3 and env.now.mass.std() > 0.03
     assert ((-total[:, 2] / weight - 1).abs() < 0.01).all()
-    # Sideways the thumb's force and the fingers' cancel.
+    # Sideways, the forces of thumb and fingers cancel.
     assert (total[:, :2].norm(dim=1) < 0.01 * 7).all()
     env.close()
 
 
-def test_groups(env):
+def test_groups_of_observations(env):
     obs = env.reset(0)
     links = len(env.task.setup.links)
     assert env.groups == {
@@ -204,51 +204,51 @@ def test_groups(env):
     }  # fmt: skip
     torch.testing.assert_close(obs["goal"][:, 0].double(), env.task.command, rtol=1e-6, atol=0)
     torch.testing.assert_close(obs["priv_obj_props"][:, 1].double(), env.task.setup.mass, rtol=1e-6, atol=0)
-    assert not obs["priv_force"].any()  # nothing is looked for after a reset
+    assert not obs["priv_force"].any()  # contacts are not evaluated after a reset
     result = env.step(still(env))
-    own = result.obs["priv_force"]
-    torch.testing.assert_close(own[:, 0], own[:, 1:].sum(dim=1))
-    on = [name for name, forces in zip(env.task.setup.links, own[:, 1:].T, strict=True) if forces.any()]
-    assert on == ["right_hand_thumb_rota_link2", "right_hand_index_rota_link2", "right_hand_mid_link2"]
-    # The normal force of a link is a part of its whole force; friction is the rest.
+    normal_forces = result.obs["priv_force"]
+    torch.testing.assert_close(normal_forces[:, 0], normal_forces[:, 1:].sum(dim=1))
+    touching_links = [name for name, forces in zip(env.task.setup.links, normal_forces[:, 1:].T, strict=True) if forces.any()]
+    assert touching_links == ["right_hand_thumb_rota_link2", "right_hand_index_rota_link2", "right_hand_mid_link2"]
+    # A link's force is its normal force plus friction.
     whole = result.obs["priv_proprio"][:, 24:].view(NUM, links, 3).norm(dim=2)
-    assert (own[:, 1:] <= whole + 1e-5).all() and (own[:, 1:] > 0.6 * whole).logical_or(whole == 0).all()
+    assert (normal_forces[:, 1:] <= whole + 1e-5).all() and (normal_forces[:, 1:] > 0.6 * whole).logical_or(whole == 0).all()
 
 
-def test_commands_are_drawn_from_what_can_hold_the_object(env):
-    """Uniform from κ m g / μ, but at least 1 N, to 8 N: a Kolmogorov-Smirnov test at 1e-6, and both ends."""
-    shares, least = [], []
+def test_commands_suffice_to_hold_the_object(env):
+    """Uniform from κ m g / μ, at least 1 N, to 8 N: a Kolmogorov-Smirnov test at 1e-6, including both ends."""
+    shares, lows = [], []
     for seed in range(40):
         env.reset(seed)
         command, mass, friction = env.task.command, env.task.setup.mass, env.task.setup.friction
         low = (1.5 * mass * GRAVITY / friction).clamp(min=1.0)
         assert (command >= low).all() and (command <= 8).all() and low.max() < 7.4
         shares.append((command - low) / (8 - low))
-        least.append(low)
+        lows.append(low)
     share = torch.cat(shares).sort().values
-    assert (torch.cat(least) == 1).any()
+    assert (torch.cat(lows) == 1).any()
     gap = (share - torch.arange(len(share)) / len(share)).abs().max()
     assert gap < np.sqrt(-0.5 * np.log(0.5e-6) / len(share)) and share[0] < 0.02 and share[-1] > 0.98
 
 
 def test_commands_change_at_random_times(env, monkeypatch):
-    """Every 5 to 8 control steps, each environment by itself; the command of a step is that which was observed before it."""
+    """Every 5 to 8 control steps per environment; a step is judged by the command observed before it."""
     assert (env.task.first, env.task.last, env.task.settled) == (80, 160, 40)  # 2 s, 4 s, 1 s
     for name, steps in (("first", 5), ("last", 8), ("settled", 2)):
         monkeypatch.setattr(env.task, name, steps)
     obs, age = env.reset(0), torch.zeros(NUM, dtype=torch.int64)
     ages, changes = [], []
     for _ in range(60):
-        before, score = obs["goal"][:, 0], env.task.squares.clone()
+        observed, score = obs["goal"][:, 0], env.task.squares.clone()
         result = env.step(still(env))
         obs = result.obs
         assert not result.info.ended.any()
-        error = force_of(result) / before.double() - 1
+        error = force_of(result) / observed.double() - 1
         torch.testing.assert_close(env.task.error, error, rtol=0, atol=1e-5)
         age += 1
         is_settled = age >= 2
         torch.testing.assert_close(env.task.squares - score, torch.where(is_settled, error**2, 0.0), rtol=0, atol=1e-5)
-        is_new = obs["goal"][:, 0] != before
+        is_new = obs["goal"][:, 0] != observed
         ages += age[is_new].tolist()
         changes.append(is_new)
         age = torch.where(is_new, 0, age)
@@ -256,14 +256,14 @@ def test_commands_change_at_random_times(env, monkeypatch):
     assert len({tuple(column.tolist()) for column in torch.stack(changes).T}) == NUM
 
 
-def test_the_score_of_an_episode_without_a_settled_force_is_that_of_no_force(env):
+def test_the_score_before_forces_settle_is_that_of_no_force(env):
     env.reset(0)
     scores = [env.step(still(env)).info.score for _ in range(40)]
     assert all((score == 1).all() for score in scores[:39])  # the fortieth step is one second after the start
     assert (scores[39] < 0.5).all()
 
 
-def test_what_falls_ends_as_a_drop(env):
+def test_a_falling_object_ends_as_a_drop(env):
     env.reset(0)
     env.sim.qpos[2, 14] -= 0.05
     result = env.step(still(env))
@@ -272,7 +272,7 @@ def test_what_falls_ends_as_a_drop(env):
     assert not result.info.terms["crush"].any()
 
 
-def test_what_is_pressed_too_hard_ends_as_crushed(env):
+def test_an_object_pressed_too_hard_ends_as_crushed(env):
     env.reset(0)
     press(env, torch.where(torch.arange(NUM) == 4, 25.0 / env.task.command, 1.0))
     for _ in range(12):
@@ -285,21 +285,21 @@ def test_what_is_pressed_too_hard_ends_as_crushed(env):
     assert not result.info.terms["drop"].any()
 
 
-def test_the_end_of_one_episode_leaves_the_others_alone(env):
-    """One object is taken away in one run and not in the other: all others go on as they do there, to the last bit."""
-    kept = []
-    for is_taken in (False, True):
+def test_the_end_of_one_episode_does_not_affect_the_others(env):
+    """One run removes an object and the other does not: all other environments are equal to the bit."""
+    runs = []
+    for is_removed in (False, True):
         env.reset(3)
         rows = []
         for i, action in enumerate(random_actions(env, 12)):
-            if is_taken and i == 4:
+            if is_removed and i == 4:
                 env.sim.qpos[5, 12] += 0.1
             result = env.step(action)
-            assert result.terminated.tolist() == [is_taken and i == 4 and env_id == 5 for env_id in range(NUM)]
+            assert result.terminated.tolist() == [is_removed and i == 4 and env_id == 5 for env_id in range(NUM)]
             rows.append(torch.cat([*result.obs.values(), result.reward[:, None]], dim=1))
-        kept.append(torch.stack(rows))
-    others = [i for i in range(NUM) if i != 5]
-    assert torch.equal(kept[0][:, others], kept[1][:, others]) and not torch.equal(kept[0][5:, 5], kept[1][5:, 5])
+        runs.append(torch.stack(rows))
+    other_envs = [i for i in range(NUM) if i != 5]
+    assert torch.equal(runs[0][:, other_envs], runs[1][:, other_envs]) and not torch.equal(runs[0][5:, 5], runs[1][5:, 5])
 
 
 @pytest.mark.parametrize(
@@ -311,7 +311,7 @@ def test_the_end_of_one_episode_leaves_the_others_alone(env):
         ({"rewards": {"grip": 1}}, "rewards.grip", "unknown key"),
     ],
 )
-def test_mistakes_are_located(changes, path, says):
+def test_errors_are_located(changes, path, says):
     with pytest.raises(SpecError) as caught:
         load_task(DOCUMENT, changes)
     (problem,) = caught.value.problems
@@ -326,45 +326,45 @@ def test_mistakes_are_located(changes, path, says):
         ({"change": (0.01, 1.0)}, "commands change every 0.01 s, more often than control steps of 0.025 s"),
     ],
 )
-def test_starts_and_times_that_do_not_fit_the_scene_are_refused(env, changes, says):
+def test_mismatched_starts_and_times_are_refused(env, changes, says):
     with pytest.raises(LowerError, match=says) as caught:
         GripForce(env.spec.model_copy(update=changes), env.task.setup)
     assert [caught.value.field] == list(changes)
 
 
 @pytest.mark.slow
-def test_every_object_is_held_for_ten_seconds_without_an_action():
-    """Of all masses, frictions and commands: with what the command asks for, to 15 % and 0.4 N, and at most 1 cm lower."""
+def test_every_object_is_held_for_ten_seconds_without_actions():
+    """For all masses, frictions and commands: the force is within 15 % and 0.4 N, the object sinks at most 1 cm."""
     env = grip(2 * NUM, change=["20 s", "20 s"])
-    asked, forces = env.task.command.clone(), []
-    place = env.task.start_pos.clone()
+    commands, forces = env.task.command.clone(), []
+    start = env.task.start_pos.clone()
     for i in range(env.max_steps):
         result = env.step(still(env))
         assert not result.terminated.any()
         forces += [force_of(result)] if i > 40 else []
     force = torch.stack(forces).mean(dim=0)
-    assert ((force - asked).abs() < 0.15 * asked + 0.4).all()
-    moved = (result.info.final_obs["priv_obj_state"][:, :3].double() - place).norm(dim=1)
-    assert moved.max() < 0.01 and moved.median() < 0.002
+    assert ((force - commands).abs() < 0.15 * commands + 0.4).all()
+    distance = (result.info.final_obs["priv_obj_state"][:, :3].double() - start).norm(dim=1)
+    assert distance.max() < 0.01 and distance.median() < 0.002
     env.close()
 
 
 @pytest.mark.slow
 def test_the_whole_range_of_commands_can_be_pressed():
-    """A script that closes the loop reaches 1 to 8 N with every object, within 5 %, with 40 % of the drives' torque."""
+    """A closed loop reaches 1 to 8 N with every object within 5 %, using 40 % of the drives' torque."""
     env = grip(change=["20 s", "20 s"], randomise__mass=["0 g", "0 g"])
     limit = torch.from_numpy(env.task.setup.actuators.limit)
-    for wanted in (1.0, 2.0, 4.0, 8.0):
+    for target in (1.0, 2.0, 4.0, 8.0):
         env.reset(0)
-        *_, result = held_at(env, torch.full((NUM,), wanted).double(), 160)
+        *_, result = regulated_steps(env, torch.full((NUM,), target).double(), 160)
         assert not result.terminated.any()
-        assert ((force_of(result) / wanted - 1).abs() < 0.05).all()
+        assert ((force_of(result) / target - 1).abs() < 0.05).all()
         assert (env.now.torque.abs() / limit).max() < 0.4
     env.close()
 
 
 @pytest.mark.slow
-def test_the_keyframes_are_those_that_the_script_finds(monkeypatch):
+def test_the_keyframes_equal_the_scripts(monkeypatch):
     monkeypatch.syspath_prepend(str(FOLDER))
     import grip_starts
 
@@ -382,8 +382,8 @@ def test_the_keyframes_are_those_that_the_script_finds(monkeypatch):
 
 
 @pytest.mark.slow
-def test_mujoco_warp_holds_it_too():
-    """Half a second with the same draws: forces agree to 5 % and 0.2 N, and commands to rounding."""
+def test_mujoco_warp_agrees():
+    """Over half a second with the same draws, forces agree to 5 % and 0.2 N, commands to rounding."""
     forces = []
     for simulator in ("mujoco", "warp"):
         env = TouchEnv(DOCUMENT, NUM, overrides=PLAIN, simulator=simulator)

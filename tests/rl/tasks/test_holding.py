@@ -1,4 +1,4 @@
-"""What progress pays while an object is held, and while it coasts."""
+"""Pay for progress while an object is held, and while it coasts."""
 
 from types import SimpleNamespace
 
@@ -24,16 +24,16 @@ HAND = """<mujoco><worldbody>
 LINKS = ("palm", "near", "far", "jaw")
 FORCES = [
     ((0.0, 0.0, 0.0, 0.0), False),
-    ((9.0, 0.0, 0.0, 0.0), False),  # on the palm alone
-    ((0.0, 9.0, 0.0, 0.0), False),  # one finger alone
-    ((0.05, 0.05, 0.0, 0.0), True),  # the palm and a finger, just so
+    ((9.0, 0.0, 0.0, 0.0), False),  # only the palm
+    ((0.0, 9.0, 0.0, 0.0), False),  # only one finger
+    ((0.05, 0.05, 0.0, 0.0), True),  # the palm and a finger, just above the load
     ((0.04, 0.05, 0.0, 0.0), False),
     ((0.0, 0.0, 1.0, 1.0), True),  # two fingers
 ]
 
 
-def test_links_that_move_by_themselves_are_fingers():
-    """The palm and what is fixed to it are none, though a slide moves the whole hand; and a hinge that moves all links counts."""
+def test_links_that_move_relative_to_the_palm_are_fingers():
+    """The palm and links fixed to it are not, though a slide moves the hand; without a palm, a hinged link counts."""
     model = mujoco.MjModel.from_xml_string(HAND)
     assert are_fingers(model, LINKS).tolist() == [False, True, True, True]
     assert are_fingers(model, ("near",)).tolist() == [True]
@@ -41,12 +41,12 @@ def test_links_that_move_by_themselves_are_fingers():
 
 
 def instant(forces):
-    """Return an instant of forces along a slanted axis, of lengths that are given for each link."""
+    """Return an instant with forces along a slanted axis, whose sizes are given per link."""
     force = torch.tensor(forces, dtype=torch.float64)[:, :, None] * torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64)
     return SimpleNamespace(link_force=force, joint_pos=torch.zeros(len(forces), 1, dtype=torch.float64))
 
 
-def test_two_fingers_or_one_and_the_palm_hold():
+def test_two_fingers_or_a_finger_and_the_palm_hold():
     setup = SimpleNamespace(model=mujoco.MjModel.from_xml_string(HAND), links=LINKS, device="cpu")
     spec = HoldSpec(coasting_pay=0.3, load=0.0499)
     now = instant([forces for forces, _ in FORCES])
@@ -60,7 +60,7 @@ def test_two_fingers_or_one_and_the_palm_hold():
 
 
 def test_torques_and_speeds_cost():
-    """|τ/τ_max| of 1/2, 1 and none: 1.25; 0.4 m/s with 0.2 free, 3 rad/s with 2 free: 1 + 0.5; slower costs nothing."""
+    """|τ/τ_max| of 1/2, 1 and none: 1.25. Speeds of 0.4 m/s (0.2 free) and 3 rad/s (2 free): 1 + 0.5; slower is free."""
     now = SimpleNamespace(
         torque=torch.tensor([[0.5, -0.4, 3.0]]),
         object=SimpleNamespace(
@@ -72,9 +72,9 @@ def test_torques_and_speeds_cost():
     assert terms.ObjectSpeed(weight=1, free_speed=0.2, free_spin=2.0).rate(now, setup).tolist() == pytest.approx([1.5, 0.0])
 
 
-def test_a_coasting_object_earns_its_share(tmp_path):
-    """A ball that a script turns without a touch: turning pays c of what it pays else, turning back costs as much as ever."""
-    found = {}
+def test_a_coasting_object_earns_a_share(tmp_path):
+    """The test turns a ball that nothing touches: turning forward pays the share c, turning back costs in full."""
+    sums = {}
     for pay in (1.0, 0.25):
         (tmp_path / str(pay)).mkdir()
         more = f"hold: {{coasting_pay: {pay}}}\nrewards: {{near: 0, work: 0}}\nepisode: 10 s\n"
@@ -88,8 +88,8 @@ def test_a_coasting_object_earns_its_share(tmp_path):
             env.sim.qpos[:, 6:10] = torch.stack([half.cos(), 0 * half, 0 * half, half.sin()], dim=1)
             env.sim.qvel[:] = 0
             earned.append(env.step(torch.zeros(2, 2)).info.terms)
-        found[pay] = {name: sum(term[name] for term in earned) for name in ("success", "spin")}
+        sums[pay] = {name: sum(term[name] for term in earned) for name in ("success", "spin")}
         env.close()
-    assert found[1.0]["success"][0] == pytest.approx(150 * 0.025)
-    assert found[0.25]["success"].tolist() == pytest.approx([0.25 * 150 * 0.025, 0.0], rel=1e-6)
-    assert found[0.25]["spin"].tolist() == pytest.approx([0.25 * found[1.0]["spin"][0].item(), found[1.0]["spin"][1].item()])
+    assert sums[1.0]["success"][0] == pytest.approx(150 * 0.025)
+    assert sums[0.25]["success"].tolist() == pytest.approx([0.25 * 150 * 0.025, 0.0], rel=1e-6)
+    assert sums[0.25]["spin"].tolist() == pytest.approx([0.25 * sums[1.0]["spin"][0].item(), sums[1.0]["spin"][1].item()])

@@ -1,4 +1,4 @@
-"""Turning an object to one orientation after another: rewards and ends against the reference, goals, and what pays."""
+"""Turning an object to a sequence of orientations: rewards and terminations against the reference, goals, incentives."""
 
 import math
 from pathlib import Path
@@ -47,14 +47,14 @@ def random_actions(env, num, seed=0):
 
 
 def goal_steps(env, episode, goal, seed=0):
-    """Return how many control steps there are for a goal."""
+    """Return the number of control steps allowed for a goal."""
     low, high = env.spec.goal_timeout
     share = Draws(seed, env.num_envs).shares({"goal timeout": 1}, torch.full((env.num_envs,), (episode << 32) + goal))
     return np.round((low + (high - low) * share["goal timeout"][:, 0].numpy()) / env.control_step).astype(int)
 
 
 def goal_axes(num_envs, episode, goal, kind="any", seed=0, step=0.3):
-    """Return the axes that the goals of some episode turn about, from the counted numbers; of `xy` angles about both."""
+    """Return the axes of an episode's goals from the counted numbers; for `xy`, the angles about both axes."""
     count = torch.full((num_envs,), (episode << 32) + goal)
     draws = Draws(seed, num_envs)
     if kind == "vertical":
@@ -67,7 +67,7 @@ def goal_axes(num_envs, episode, goal, kind="any", seed=0, step=0.3):
 
 
 def put(env, rotation):
-    """Turn each environment's ball by a script: it is at rest there."""
+    """Turn each environment's ball to a rotation, at rest."""
     quat = np.roll(rotation.as_quat(), 1, axis=-1)
     env.sim.qpos[:, 6:10] = torch.from_numpy(np.broadcast_to(quat, (env.num_envs, 4)).copy())
     env.sim.qvel[:, 3:] = 0
@@ -78,62 +78,64 @@ def rest(env):
 
 
 def compare(env, recorder, first_episode=2, kind="any"):
-    """Compare all that was recorded with the reference; return the terms of all episodes by name."""
-    axes, seen, records = {}, [], iter(recorder.records())
+    """Compare the records with the reference; return the terms of all episodes by name."""
+    axes, all_terms, records = {}, [], iter(recorder.records())
     for env_id, episodes in enumerate(recorder.episodes):
         for number, (_, rows) in enumerate(episodes, start=first_episode):
             if not rows:
                 continue
-            record, found = next(records)
+            record, actual = next(records)
             if number not in axes:
                 axes[number] = [goal_axes(env.num_envs, number, k, kind) for k in range(12)]
             name = "goal_angles" if kind == "xy" else "goal_axis"
             record[name] = np.stack([axis[env_id] for axis in axes[number]])
             record["goal_steps"] = [goal_steps(env, number, k)[env_id] for k in range(12)]
             expected = reference_rates(env.task, in_hand_repose, env.spec, record, env.control_step)
-            assert expected.keys() == found.keys()
+            assert expected.keys() == actual.keys()
             for name, value in expected.items():
                 scale = max(1.0, float(np.abs(value).max()))
-                np.testing.assert_allclose(found[name], value, rtol=0, atol=1e-6 * scale, err_msg=name)
-            seen.append(found)
+                np.testing.assert_allclose(actual[name], value, rtol=0, atol=1e-6 * scale, err_msg=name)
+            all_terms.append(actual)
     assert next(records, None) is None
-    return seen
+    return all_terms
 
 
 @pytest.mark.parametrize("kind", ["any", "vertical"])
 def test_rewards_ends_and_scores_equal_the_reference(tmp_path, kind):
-    """With weights that are not those of the task, each by another factor."""
+    """Each weight differs from the task's by its own factor."""
     weights = {name: (1.5 + 0.1 * i) * value for i, (name, value) in enumerate(InHandRepose.Rewards())}
     env = repose(tmp_path, 4, QUICK, "0 0 -9.81", kind, overrides={"rewards": weights})
     recorder = Recorder(env)
     for i, action in enumerate(random_actions(env, 70)):
-        env.sim.qvel[1, 6:9] = 3.0 if i % 4 else -3.0  # turned by hand: nothing else turns a ball
+        env.sim.qvel[1, 6:9] = 3.0 if i % 4 else -3.0  # nothing else turns a ball
         if i % 5 in (0, 1):
             env.sim.qpos[0, 6:10] = env.task.goal[0]
         recorder.step(action if i < 40 else torch.ones_like(action))
-    seen = compare(env, recorder, kind=kind)
-    assert len(seen) >= 12 and max(rows["score"].max() for rows in seen) >= 2
-    assert sum(rows["goal_timeout"].any() for rows in seen) >= 2 and sum(rows["drop"].any() for rows in seen) >= 1
+    episodes = compare(env, recorder, kind=kind)
+    assert len(episodes) >= 12 and max(rows["score"].max() for rows in episodes) >= 2
+    assert sum(rows["goal_timeout"].any() for rows in episodes) >= 2 and sum(rows["drop"].any() for rows in episodes) >= 1
     terms = set(InHandRepose.Rewards.model_fields) | {"is_over", "score"}
-    assert {name for rows in seen for name, value in rows.items() if np.abs(value).max() > 1e-9} == terms
-    most = 2 * weights["progress"]
-    assert max(np.abs(rows["progress"]).max() for rows in seen) > most  # what is faster the wrong way costs more
-    assert max(rows["progress"].max() for rows in seen) <= most + 1e-6
+    assert {name for rows in episodes for name, value in rows.items() if np.abs(value).max() > 1e-9} == terms
+    max_progress = 2 * weights["progress"]
+    assert max(np.abs(rows["progress"]).max() for rows in episodes) > max_progress  # losses are not clipped
+    assert max(rows["progress"].max() for rows in episodes) <= max_progress + 1e-6
 
 
-def test_goals_about_x_and_y_and_times_that_are_drawn_equal_the_reference(tmp_path):
-    own = "drop_measure: below\nmin_spin: -1\nbackward: 2\ngoal: [orientation, difference, angle]\n"
-    env = repose(tmp_path, 4, QUICK.replace("goal_timeout: 0.3 s", "goal_timeout: [0.15 s, 0.4 s]") + own, "0 0 -9.81", "xy")
+def test_xy_goals_and_random_times_equal_the_reference(tmp_path):
+    settings = "drop_measure: below\nmin_spin: -1\nbackward: 2\ngoal: [orientation, difference, angle]\n"
+    env = repose(
+        tmp_path, 4, QUICK.replace("goal_timeout: 0.3 s", "goal_timeout: [0.15 s, 0.4 s]") + settings, "0 0 -9.81", "xy"
+    )
     recorder = Recorder(env)
     for i, action in enumerate(random_actions(env, 70)):
         env.sim.qvel[1, 6:9] = 3.0 if i % 4 else -3.0
         if i % 5 in (0, 1):
             env.sim.qpos[0, 6:10] = env.task.goal[0]
         recorder.step(action)
-    seen = compare(env, recorder, kind="xy")
-    assert max(rows["score"].max() for rows in seen) >= 2 and sum(rows["goal_timeout"].any() for rows in seen) >= 4
-    assert len({len(rows["score"]) for rows in seen if rows["goal_timeout"].any()}) > 3  # unlike times
-    assert min(rows["progress"].min() for rows in seen) == pytest.approx(0.2 * 2 * -1)
+    episodes = compare(env, recorder, kind="xy")
+    assert max(rows["score"].max() for rows in episodes) >= 2 and sum(rows["goal_timeout"].any() for rows in episodes) >= 4
+    assert len({len(rows["score"]) for rows in episodes if rows["goal_timeout"].any()}) > 3  # times differ
+    assert min(rows["progress"].min() for rows in episodes) == pytest.approx(0.2 * 2 * -1)
     angles = np.concatenate([goal_axes(500, 1, k, "xy") for k in range(4)])
     assert np.abs(angles).max() <= 0.3 and np.abs(angles.mean(axis=0)).max() < 0.02
     np.testing.assert_allclose(angles.std(axis=0), 0.3 / math.sqrt(3), rtol=0.05)
@@ -142,10 +144,10 @@ def test_goals_about_x_and_y_and_times_that_are_drawn_equal_the_reference(tmp_pa
 
 @pytest.mark.slow
 @pytest.mark.parametrize("document", DOCUMENTS, ids=["xhand1", "sharpa"])
-def test_the_hands_too(document):
+def test_real_hands_equal_the_reference(document):
     quick = {"episode": "0.6 s", "goal_tolerance": 0.39, "goal_hold": 2, "goal_timeout": "0.4 s"}
-    moved = {"action": {"mode": "relative", "scale": 0.3}, "touch": "none"}
-    env = TouchEnv(document, 4, threads=1, overrides=quick | moved)
+    controls = {"action": {"mode": "relative", "scale": 0.3}, "touch": "none"}
+    env = TouchEnv(document, 4, threads=1, overrides=quick | controls)
     recorder = Recorder(env)
     for action in random_actions(env, 60):
         recorder.step(action)
@@ -165,7 +167,7 @@ def test_terms_at_a_known_angle(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["any", "vertical"])
-def test_the_right_way_beats_rest_and_rest_beats_the_wrong_way(tmp_path, kind):
+def test_turning_right_beats_rest_and_rest_beats_turning_wrong(tmp_path, kind):
     env = repose(tmp_path, 5, axis=kind)
     env.reset()
     axes, total = goal_axes(5, 2, 0, kind), torch.zeros(5)
@@ -177,60 +179,60 @@ def test_the_right_way_beats_rest_and_rest_beats_the_wrong_way(tmp_path, kind):
 
 
 @pytest.mark.parametrize("there", [0.05, 0.1, 0.3], ids=["slowly", "at max_spin", "faster than max_spin"])
-def test_away_and_back_again_makes_no_progress(tmp_path, there):
-    """Fast away and slowly back, or the other way round: a loss is never clipped, a gain is."""
+def test_turning_away_and_back_makes_no_progress(tmp_path, there):
+    """In either order of fast and slow: gains are clipped, losses never."""
     env = repose(tmp_path, 2)
     env.reset()
-    axes, paid = goal_axes(2, 2, 0), torch.zeros(2)
+    axes, progress = goal_axes(2, 2, 0), torch.zeros(2)
     for first, second in ((there, 0.05), (0.05, there)):
         path = [*np.arange(0, 0.6, first)[1:], 0.6, *np.arange(0.6, 0, -second)[1:], 0.0]
         for angle in path:
             put(env, Rotation.from_rotvec(-angle * axes))
-            paid += rest(env).info.terms["progress"]
-    assert (paid < 1e-6).all()
+            progress += rest(env).info.terms["progress"]
+    assert (progress < 1e-6).all()
     if there <= 0.1:
-        assert paid.tolist() == pytest.approx([0.0, 0.0], abs=1e-6)
+        assert progress.tolist() == pytest.approx([0.0, 0.0], abs=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["any", "vertical"])
-def test_a_goal_is_held_and_the_next_one_starts_from_it(tmp_path, kind):
+def test_each_goal_must_be_held_and_the_next_starts_from_it(tmp_path, kind):
     env = repose(tmp_path, 3, "episode: 20 s\ngoal_hold: 3\n", axis=kind)
     obs, goal = env.reset(), Rotation.identity(3)
     for k in range(4):
         goal = Rotation.from_rotvec(0.4 * goal_axes(3, 2, k, kind)) * goal
         columns = goal.as_matrix()[:, :, :2].transpose(0, 2, 1).reshape(3, 6)
         np.testing.assert_allclose(obs["goal"][:, :6], columns, rtol=0, atol=1e-6)
-        beside = Rotation.from_rotvec([0.05, 0, 0]) * goal  # within the tolerance, and no part of the goal after
-        put(env, beside)
+        near_goal = Rotation.from_rotvec([0.05, 0, 0]) * goal  # within the tolerance, without effect on the next goal
+        put(env, near_goal)
         for held in range(1, 4):
-            made = rest(env)
-            obs = made.obs
-            assert made.info.terms["success"].tolist() == pytest.approx([500 * env.control_step * (held == 3)] * 3)
-            assert made.info.score.tolist() == [k + (held == 3)] * 3
+            result = rest(env)
+            obs = result.obs
+            assert result.info.terms["success"].tolist() == pytest.approx([500 * env.control_step * (held == 3)] * 3)
+            assert result.info.score.tolist() == [k + (held == 3)] * 3
             if held < 3:
                 assert obs["goal"][:, 6].tolist() == pytest.approx([0.05] * 3, abs=1e-6)
         assert ((obs["goal"][:, 6] >= 0.35 - 1e-6) & (obs["goal"][:, 6] <= 0.45 + 1e-6)).all()
-        # Its change of goal is no progress, neither forth nor back.
+        # A change of the goal is no progress.
         assert rest(env).info.terms["progress"].tolist() == pytest.approx([0.0] * 3, abs=1e-6)
 
 
-def test_a_goal_that_is_left_too_early_is_not_reached(tmp_path):
+def test_a_goal_left_too_early_is_not_reached(tmp_path):
     env = repose(tmp_path, 2, "episode: 20 s\ngoal_hold: 3\n")
     env.reset()
     goal = Rotation.from_rotvec(0.4 * goal_axes(2, 2, 0))
-    for there in (True, True, False, True, True, False):
-        put(env, goal if there else Rotation.identity(2))
+    for is_at_goal in (True, True, False, True, True, False):
+        put(env, goal if is_at_goal else Rotation.identity(2))
         assert not rest(env).info.terms["success"].any()
     assert env.task.score().tolist() == [0, 0]
 
 
-def test_a_goal_that_takes_too_long_ends_the_episode_for_good(tmp_path):
+def test_a_goal_that_takes_too_long_terminates_the_episode(tmp_path):
     env = repose(tmp_path, 2, "episode: 20 s\ngoal_hold: 1\ngoal_timeout: 0.1 s\n")
     env.reset()
     for _ in range(2):
         rest(env)
     goal = Rotation.from_rotvec(0.4 * goal_axes(2, 2, 0)).as_rotvec()
-    goal[1] = 0  # the second one stays where it was
+    goal[1] = 0  # the second object stays in place
     put(env, Rotation.from_rotvec(goal))
     assert rest(env).info.score.tolist() == [1, 0]
     made = rest(env)
@@ -240,7 +242,7 @@ def test_a_goal_that_takes_too_long_ends_the_episode_for_good(tmp_path):
     assert [rest(env).terminated.tolist() for _ in range(4)] == [[False, False], [False, False], [True, False], [False, True]]
 
 
-def test_a_goal_reached_in_the_last_moment_is_not_late(tmp_path):
+def test_a_goal_reached_at_the_last_step_is_in_time(tmp_path):
     env = repose(tmp_path, 1, "episode: 20 s\ngoal_hold: 2\ngoal_timeout: 0.1 s\n")
     env.reset()
     for _ in range(2):
@@ -251,7 +253,7 @@ def test_a_goal_reached_in_the_last_moment_is_not_late(tmp_path):
     assert made.info.score.tolist() == [1] and not made.terminated.any()
 
 
-def test_what_is_dropped_ends_the_episode_for_good(tmp_path):
+def test_a_dropped_object_terminates_the_episode(tmp_path):
     env = repose(tmp_path, 2, "episode: 20 s\n")
     env.reset()
     env.sim.qpos[:, 5] += torch.tensor([0.079, 0.081])
@@ -261,19 +263,19 @@ def test_what_is_dropped_ends_the_episode_for_good(tmp_path):
     assert made.info.terms["drop"].tolist() == pytest.approx([0, -100 * env.control_step])
 
 
-def test_an_episode_that_has_lasted_is_truncated_and_leaves_the_others_alone(tmp_path):
+def test_truncating_one_episode_does_not_affect_the_others(tmp_path):
     env = repose(tmp_path, 3, "episode: 1 s\ngoal_hold: 1\n")
     env.reset()
     put(env, Rotation.from_rotvec(0.4 * goal_axes(3, 2, 0)))
     rest(env)
     env.steps[1] = env.max_steps - 1
-    before = {name: value.clone() for name, value in env.task.memory.items()}
+    old_memory = {name: value.clone() for name, value in env.task.memory.items()}
     made = rest(env)
     assert made.truncated.tolist() == [False, True, False] and not made.terminated.any()
     memory = env.task.memory
     assert memory["episode"].tolist() == [2, 3, 2] and memory["reached"].tolist() == [1, 0, 1]
     assert memory["waited"].tolist() == [1, 0, 1] and memory["held"].tolist() == [0, 0, 0]
-    assert torch.equal(memory["goal"][[0, 2]], before["goal"][[0, 2]])
+    assert torch.equal(memory["goal"][[0, 2]], old_memory["goal"][[0, 2]])
     goal = Rotation.from_rotvec(0.4 * goal_axes(3, 3, 0)[1]).as_matrix()[:, :2].T.reshape(6)
     np.testing.assert_allclose(made.obs["goal"][1, :6], goal, rtol=0, atol=1e-6)
     np.testing.assert_allclose(made.obs["goal"][1, 6], 0.4, rtol=0, atol=1e-6)
@@ -281,7 +283,7 @@ def test_an_episode_that_has_lasted_is_truncated_and_leaves_the_others_alone(tmp
 
 
 @pytest.mark.parametrize("kind", ["any", "vertical"])
-def test_axes_are_uniform_and_those_of_each_environment_whatever_the_batch(tmp_path, kind):
+def test_axes_are_uniform_and_do_not_depend_on_the_batch(tmp_path, kind):
     env = repose(tmp_path / "all", 300, axis=kind)
     parts = [repose(tmp_path / str(i), 150, axis=kind, first_env=150 * i) for i in (0, 1)]
     axes = []
@@ -297,32 +299,32 @@ def test_axes_are_uniform_and_those_of_each_environment_whatever_the_batch(tmp_p
         assert abs(axis[:, 2].mean()) < 5 / math.sqrt(len(axis))
         return
     assert (np.abs(axis.mean(axis=0)) < 5 * math.sqrt(1 / 3 / len(axis))).all()
-    # Uniform on the sphere: each component uniform from −1 to 1, of variance 1/3, whose own variance is 4/45.
+    # On the sphere each component is uniform from −1 to 1: variance 1/3, and 4/45 for its square.
     assert (np.abs((axis**2).mean(axis=0) - 1 / 3) < 5 * math.sqrt(4 / 45 / len(axis))).all()
 
 
 @pytest.fixture(scope="module")
 def busy(tmp_path_factory):
-    """Environments in a state where no term is zero but those of events, which are set by hand."""
+    """Return environments where all terms are nonzero; those of events are set by hand."""
     env = repose(tmp_path_factory.mktemp("busy"), 3, QUICK, "0 0 -9.81")
     for i in range(10):
         env.sim.qvel[:, 6:9] = 3.0
         result = env.step(torch.tensor([[1.0, -1.0 if i % 3 else -0.8]] * 3))
         assert torch.stack(list(result.info.terms.values())).sum(dim=0).tolist() == pytest.approx(result.reward.tolist())
-    for own, value in ((env.task.is_reached, True), (env.task.is_late, True), (env.task.start_pos, 9.0)):
-        own.fill_(value)
+    for tensor, value in ((env.task.is_reached, True), (env.task.is_late, True), (env.task.start_pos, 9.0)):
+        tensor.fill_(value)
     return env
 
 
 def changed_terms(env, **changes):
-    """Return the terms of the reward at an instant with some values of the document changed."""
+    """Return the reward's terms with changed values of the document."""
     task = InHandRepose(env.task.spec.model_copy(update=changes), env.task.setup)
     for name, value in env.task.memory.items():
         task.memory[name].copy_(value)
     return task.reward(env.now, task.is_over(env.now))
 
 
-def test_every_term_is_there(busy):
+def test_every_term_is_nonzero(busy):
     assert all(term.abs().max() > 1e-9 for term in changed_terms(busy).values())
 
 
@@ -336,7 +338,7 @@ def test_every_term_is_there(busy):
         ("drop_distance", 99.0, "drop", True),
     ],
 )
-def test_a_number_changes_its_term_alone(busy, name, value, term, grows):
+def test_a_parameter_changes_only_its_term(busy, name, value, term, grows):
     other, plain = changed_terms(busy, **{name: value}), changed_terms(busy)
     differs = {key for key in plain if not torch.equal(plain[key], other[key])}
     assert differs == {term}
@@ -355,7 +357,7 @@ def test_a_number_changes_its_term_alone(busy, name, value, term, grows):
         ({"randomise.friction": [-1, 1]}, "friction"),
     ],
 )
-def test_a_goal_that_cannot_be_is_refused(changes, said):
+def test_impossible_goals_are_refused(changes, said):
     with pytest.raises(SpecError) as error:
         load_task(DOCUMENTS[0], changes)
     assert said in str(error.value)
@@ -375,12 +377,12 @@ def test_the_documents_have_the_papers_numbers(document):
     assert list(InHandRepose.Rewards().model_dump().values()) == weights
     assert spec.rewards == (
         InHandRepose.Rewards(joint_limit=-4) if document is DOCUMENTS[0] else InHandRepose.Rewards()
-    )  # docs/records/learned.md says why
+    )  # explained in docs/records/learned.md
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("document", "joints"), [(DOCUMENTS[0], 12), (DOCUMENTS[1], 22)], ids=["xhand1", "sharpa"])
-def test_each_hand_holds_all_objects_without_an_action(document, joints):
+def test_each_hand_holds_all_objects_without_actions(document, joints):
     quiet = {"touch": "none", "goal_timeout": "1000 s", "randomise.push": {"x": 0}}
     env = TouchEnv(document, 16, threads=1, overrides=quiet)
     assert env.num_actions == joints and env.task.setup.num_variants == 16

@@ -1,4 +1,4 @@
-"""Spinning a screwdriver: rewards, ends and scores against the reference, what pays, what is observed."""
+"""Spinning a screwdriver: rewards, terminations and scores against the reference, incentives, observations."""
 
 import math
 import runpy
@@ -23,7 +23,7 @@ ODD = {
     "action.slide_scale": 0.01, "randomise.push": {"x": ["-3 N", "3 N"], "y": ["-3 N", "3 N"], "interval": ["0.1 s", "0.2 s"]},
     "rewards": {name: 1.5 * value or -0.5 for name, value in Screwdriver.Rewards()}, "max_force": "0.1 N", "hold": {"coasting_pay": 0.25},
 }  # fmt: skip
-"""Other numbers than the document's, and enough going on that every term is seen."""
+"""Numbers unlike the document's, chosen so that every term occurs."""
 FREE = slice(3, 10)
 """The rod's part of `qpos`."""
 
@@ -45,90 +45,90 @@ def rotation(quat):
     )
 
 
-def by_tip(env, upright, length):
-    """Return the reference, given where the tip is: so far below the body's origin, which was upright at a place."""
+def reference_with_tip(env, upright, length):
+    """Return the reference for a tip at a given length below the body, which was upright at a given place."""
     setup = env.task.setup
-    own = {"fingers": are_fingers(setup.model, setup.links)}
+    extra = {"fingers": are_fingers(setup.model, setup.links)}
 
-    def told(spec, record, dt):
+    def reference(spec, record, dt):
         down = np.array([0, 0, -length])
         tip = record["pos"] + np.stack([rotation(quat) @ down for quat in record["quat"]])
-        return screwdriver(spec, {**record, **own, "tip": tip, "upright_pos": upright, "upright_tip": upright + down}, dt)
+        return screwdriver(spec, {**record, **extra, "tip": tip, "upright_pos": upright, "upright_tip": upright + down}, dt)
 
-    return told
+    return reference
 
 
 @pytest.fixture(scope="module")
 def env(tmp_path_factory):
-    """Four rods without weight and drives without faults."""
-    made = pincer_env(tmp_path_factory.mktemp("rod"), 4, gravity="0 0 0", more="episode: 10 s\n")
-    yield made
-    made.close()
+    """Four rods without weight, with ideal drives."""
+    environment = pincer_env(tmp_path_factory.mktemp("rod"), 4, gravity="0 0 0", more="episode: 10 s\n")
+    yield environment
+    environment.close()
 
 
 def test_rewards_ends_and_scores_equal_the_reference(tmp_path):
     env = pincer_env(tmp_path, 6, overrides=ODD)
     recorder = Recorder(env)
     for i, action in enumerate(random_actions(env, 90)):
-        action[0] = -1.0  # this one opens to the end of its range, and its rod stays where it is
+        action[0] = -1.0  # opens to the end of its range; its rod stays in place
         env.sim.qpos[0, FREE], env.sim.qvel[0, 3:] = torch.tensor([0, 0, 0.1, 1, 0, 0, 0]), 0.0
         if i % 10 < 4:
-            env.sim.qvel[1:3, 8] = torch.tensor([-8.0, 3.0], dtype=torch.float64)  # spun by hand
+            env.sim.qvel[1:3, 8] = torch.tensor([-8.0, 3.0], dtype=torch.float64)  # nothing else spins them
         recorder.step(action)
     assert sum(len(episodes) for episodes in recorder.episodes) > 18
-    found = assert_reference(recorder, by_tip(env, np.array([0, 0, 0.1]), LENGTH))
-    assert found == {*Screwdriver.Rewards.model_fields, "is_over", "score"}
+    names = assert_reference(recorder, reference_with_tip(env, np.array([0, 0, 0.1]), LENGTH))
+    assert names == {*Screwdriver.Rewards.model_fields, "is_over", "score"}
     env.close()
 
 
 def test_bounds_and_stalled_episodes_equal_the_reference(tmp_path):
-    own = {
+    settings = {
         "max_spin": 0.2,
         "min_spin": -0.2,
         "stall": {"within": "0.25 s", "turn": 0.2},
         "engagement": "5 cm",
         "drop_tilt": 1.5,
     }
-    env = pincer_env(tmp_path, 4, overrides=ODD | own | {"episode": "3 s", "randomise.push": "{}"})
+    env = pincer_env(tmp_path, 4, overrides=ODD | settings | {"episode": "3 s", "randomise.push": "{}"})
     recorder = Recorder(env)
     for i, action in enumerate(random_actions(env, 60)):
         env.sim.qvel[:, 8] = torch.tensor([-8.0, -0.5, 0.0, 3.0], dtype=torch.float64) * (i < 40)
         recorder.step(action)
-    seen = assert_reference(recorder, by_tip(env, np.array([0, 0, 0.1]), LENGTH))
-    assert {"spin", "is_over"} <= seen
+    names = assert_reference(recorder, reference_with_tip(env, np.array([0, 0, 0.1]), LENGTH))
+    assert {"spin", "is_over"} <= names
     lengths = [[len(rows) for _, rows in episodes] for episodes in recorder.episodes]
     assert max(lengths[0]) > 20 and max(lengths[2]) == 10, lengths
     env.close()
 
 
 @pytest.mark.slow
-def test_the_hand_too():
+def test_the_real_hand_equals_the_reference():
     env = TouchEnv(DOCUMENT, 8, threads=1, overrides={"touch": "none", "grasps.num": 16})
     recorder = Recorder(env)
     for action in random_actions(env, 80):
         recorder.step(action)
-    found = assert_reference(recorder, by_tip(env, np.array([0.09, 0.08, 0.215]), 0.19))
-    assert {*Screwdriver.Rewards.model_fields, "is_over", "score"} - {"joint_limit", "contact_force", "effort"} <= found
+    names = assert_reference(recorder, reference_with_tip(env, np.array([0.09, 0.08, 0.215]), 0.19))
+    assert {*Screwdriver.Rewards.model_fields, "is_over", "score"} - {"joint_limit", "contact_force", "effort"} <= names
     env.close()
 
 
-def turned(env, rates, steps=8, tilt=0.0):
-    """Return the mean reward of rods that a script turns clockwise as seen from above, at a rate each [rad/s]."""
+def reward_of_turning(env, rates, steps=8, tilt=0.0):
+    """Return the mean reward of rods turned clockwise, seen from above, at given rates [rad/s]."""
     env.reset(0)
     total, rates = torch.zeros(env.num_envs), torch.as_tensor(rates, dtype=torch.float64)
-    begin = env.now.object.quat.clone()
+    start = env.now.object.quat.clone()
     for i in range(1, steps + 1):
-        place(env, -rates * env.control_step * i, tilt, begin)
+        place(env, -rates * env.control_step * i, tilt, start)
         total += env.step(torch.zeros(env.num_envs, env.num_actions)).reward
     return total / steps
 
 
-def place(env, yaw, tilt, begin=None):
-    """Turn rods about their own axis, then tilt them about the world's x, the tip where it was; jaws out of the way."""
+def place(env, yaw, tilt, start=None):
+    """Turn rods about their axis, then tilt them about the world's x with the tip in place; jaws stay clear."""
     yaw = torch.as_tensor(yaw, dtype=torch.float64).expand(env.num_envs)
     w, z = (0.5 * yaw).cos(), (0.5 * yaw).sin()
-    if begin is not None:
-        w, z = begin[:, 0] * w - begin[:, 3] * z, begin[:, 0] * z + begin[:, 3] * w
+    if start is not None:
+        w, z = start[:, 0] * w - start[:, 3] * z, start[:, 0] * z + start[:, 3] * w
     tilt = torch.as_tensor(tilt, dtype=torch.float64).expand(env.num_envs)
     c, s = (0.5 * tilt).cos(), (0.5 * tilt).sin()
     quat = torch.stack([c * w, s * w, -s * z, c * z], dim=1)
@@ -139,31 +139,31 @@ def place(env, yaw, tilt, begin=None):
     env.actuation.target[:] = 0.0
 
 
-def test_the_right_way_beats_rest_and_rest_beats_the_wrong_way(env):
+def test_turning_right_beats_rest_and_rest_beats_turning_wrong(env):
     """The right way is clockwise as seen from the handle."""
-    rest, slow, right, fast = turned(env, [0.0, 0.5, 2.0, 20.0]).tolist()
-    wrong, slowly_wrong, same, far_wrong = turned(env, [-2.0, -0.5, 0.0, -20.0]).tolist()
-    assert far_wrong < wrong < slowly_wrong < rest < slow < right < fast and rest == pytest.approx(same, abs=1e-5)
-    dt, share = env.control_step, 0.975  # readings are of the start of the last physics step of 5 ms: not all of the last step
+    rest, slow, right, fast = reward_of_turning(env, [0.0, 0.5, 2.0, 20.0]).tolist()
+    wrong, slowly_wrong, rest_again, fast_wrong = reward_of_turning(env, [-2.0, -0.5, 0.0, -20.0]).tolist()
+    assert fast_wrong < wrong < slowly_wrong < rest < slow < right < fast and rest == pytest.approx(rest_again, abs=1e-5)
+    dt, share = env.control_step, 0.975  # readings are from the start of the last physics step of 5 ms
     assert right - rest == pytest.approx(10 * 2.0 * dt * share, rel=0.03)
     assert rest - wrong == pytest.approx(10 * 2.0 * dt * share, rel=0.03)
-    assert fast - rest == pytest.approx(10 * 6.0 * dt, rel=0.03)  # the most that it pays
-    assert rest - far_wrong == pytest.approx(10 * 20.0 * dt * share, rel=0.03)  # and what it costs has no bound
+    assert fast - rest == pytest.approx(10 * 6.0 * dt, rel=0.03)  # the reward is clipped
+    assert rest - fast_wrong == pytest.approx(10 * 20.0 * dt * share, rel=0.03)  # the cost is not
 
 
-def test_turning_to_and_fro_pays_nothing_however_fast_either_way(env):
-    """Slowly forth and at once back, and the other way round."""
+def test_turning_back_and_forth_pays_nothing_at_any_speed(env):
+    """Slowly forward and at once back, and the reverse."""
     env.reset(0)
-    slowly, back = np.linspace(0, 1.0, 21)[1:], np.linspace(1.0, 0, 21)[1:]
+    forward, back = np.linspace(0, 1.0, 21)[1:], np.linspace(1.0, 0, 21)[1:]
     total = torch.zeros(env.num_envs)
     place(env, 0.0, 0.0)
-    before = env.step(torch.zeros(4, 2)).info.score
-    for angle in [*slowly, 0.0, 0.0, 1.0, 1.0, *back, 0.0]:
+    old_score = env.step(torch.zeros(4, 2)).info.score
+    for angle in [*forward, 0.0, 0.0, 1.0, 1.0, *back, 0.0]:
         place(env, -angle, 0.0)
         result = env.step(torch.zeros(4, 2))
         total += result.info.terms["spin"]
-    # The fast way forth pays less than it is worth.
-    assert (total <= 1e-6).all() and (result.info.score - before).tolist() == pytest.approx([0.0] * 4, abs=1e-4)
+    # Fast forward turns are clipped.
+    assert (total <= 1e-6).all() and (result.info.score - old_score).tolist() == pytest.approx([0.0] * 4, abs=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -175,8 +175,8 @@ def test_turning_to_and_fro_pays_nothing_however_fast_either_way(env):
     ],
 )
 @pytest.mark.parametrize("degrees", [0.0, 5.0, 10.0, 20.0])
-def test_what_terms_are_worth_beside_a_spin_of_two_radians_per_second(env, term, expected, degrees):
-    """A screwdriver of 19 cm from the handle's middle to the tip, as the page's table has it."""
+def test_terms_at_two_radians_per_second(env, term, expected, degrees):
+    """For 19 cm from the handle's middle to the tip, as in the documentation's table."""
     env.reset(0)
     tilt, task = math.radians(degrees), env.task
     pos = task.upright_pos + torch.tensor([0.0, -0.19 * math.sin(tilt), 0.19 * (math.cos(tilt) - 1)], dtype=torch.float64)
@@ -188,7 +188,7 @@ def test_what_terms_are_worth_beside_a_spin_of_two_radians_per_second(env, term,
 
 
 def test_spinning_pays_up_to_a_tilt_of_fifteen_degrees():
-    """By the table: at 2 rad/s spin, alignment and distance sum to zero between 14 and 16 degrees."""
+    """At 2 rad/s, spin, alignment and distance sum to zero between 14 and 16 degrees."""
 
     def sum_at(degrees):
         tilt = math.radians(degrees)
@@ -197,23 +197,23 @@ def test_spinning_pays_up_to_a_tilt_of_fifteen_degrees():
     assert sum_at(14) > 0 > sum_at(16)
 
 
-def test_only_what_is_turned_upright_counts_for_the_score(env):
+def test_only_upright_turns_count_for_the_score(env):
     env.reset(0)
     degrees = torch.tensor([0.0, 19.0, 21.0, 40.0], dtype=torch.float64)
     tilt = torch.deg2rad(degrees)
     place(env, 0.0, tilt)
     env.step(torch.zeros(4, 2))
-    before = env.task.score().clone()
+    old_score = env.task.score().clone()
     for i in range(1, 9):
         place(env, -0.05 * i, tilt)
         result = env.step(torch.zeros(4, 2))
     assert not result.terminated.any()
-    # Over 10 s, although 0.2 s have passed.
-    assert (result.info.score - before).tolist() == pytest.approx([0.04, 0.04, 0, 0], abs=1e-3)
+    # Averaged over 10 s, although only 0.2 s have passed.
+    assert (result.info.score - old_score).tolist() == pytest.approx([0.04, 0.04, 0, 0], abs=1e-3)
     torch.testing.assert_close(env.task.tilt, tilt, rtol=0, atol=1e-4)
 
 
-def test_a_screwdriver_that_has_fallen_or_left_its_screw_ends_the_episode(env):
+def test_a_fallen_or_disengaged_screwdriver_terminates_the_episode(env):
     env.reset(0)
     place(env, 0.0, torch.tensor([0.79, 0.81, 0.0, 0.0], dtype=torch.float64))
     env.sim.qpos[2:, 5] += torch.tensor([0.0049, 0.0051], dtype=torch.float64)
@@ -221,23 +221,23 @@ def test_a_screwdriver_that_has_fallen_or_left_its_screw_ends_the_episode(env):
     assert result.terminated.tolist() == [False, True, False, True]
     assert result.info.terms["drop"].tolist() == pytest.approx([0, -2.5, 0, -2.5])
     assert env.steps.tolist() == [1, 0, 1, 0] and env.task.turned.tolist()[1] == 0.0
-    # The others go on as they were, and those begin with grasps of their own.
+    # The finished environments start from new grasps; the others continue.
     assert (env.task.tilt[[1, 3]] < 0.2).all() and env.task.tilt[0] == pytest.approx(0.79, abs=1e-3)
 
 
-def test_a_joint_at_the_end_of_its_range_and_a_hand_elsewhere_cost(env):
+def test_joint_limits_and_the_hands_pose_cost(env):
     env.reset(0)
     now, task = env.now, env.task
     pos = now.joint_pos.clone()
     pos[:, 0] = task.setup.low[0] + 0.5 * (task.setup.high[0] - task.setup.low[0]) * 1.95 + 0.02
     terms = task.reward(replace(now, joint_pos=pos), torch.zeros(4, dtype=torch.bool))
     assert terms["joint_limit"].tolist() == pytest.approx([-40 * 0.02] * 4)
-    away = (pos[:, 0] - now.joint_pos[:, 0]).square()
-    torch.testing.assert_close(terms["hand_pose"], -away)
+    deviation = (pos[:, 0] - now.joint_pos[:, 0]).square()
+    torch.testing.assert_close(terms["hand_pose"], -deviation)
 
 
-def test_groups_are_the_papers_by_name(env):
-    """No goal; the probes are in the object's state, friction and mass alone in its properties."""
+def test_groups_match_the_paper(env):
+    """There is no goal; the probes are in the object's state, and its properties are friction and mass."""
     obs = env.reset(5)
     assert env.groups == {"proprio": 6, "priv_proprio": 12, "priv_obj_state": 3 + 6 + 3 + 3 + 4, "priv_obj_props": 2}
     state, qpos = obs["priv_obj_state"].double(), env.sim.qpos
@@ -246,26 +246,26 @@ def test_groups_are_the_papers_by_name(env):
         matrix = rotation(qpos[i, 6:10].numpy())
         np.testing.assert_allclose(state[i, 3:9], np.concatenate([matrix[:, 0], matrix[:, 1]]), rtol=0, atol=1e-6)
     assert not state[:, 9:15].any()
-    # The probes touch the rod's faces, or are a little in them.
+    # The probes touch the rod's faces or slightly penetrate them.
     assert (state[:, 15:].abs() < 2e-3).all()
     volumes = torch.tensor([8 * 0.01 * 0.01 * 0.04, 8 * 0.014 * 0.014 * 0.04] * 2)
     mass = volumes * torch.tensor([1000.0, 600.0] * 2)
     torch.testing.assert_close(obs["priv_obj_props"], torch.stack([torch.ones(4), mass], dim=1))
 
 
-def test_it_begins_with_grasps_or_not_at_all(env):
+def test_the_task_requires_grasps(env):
     with pytest.raises(SimulationError, match="this task begins with grasps"):
         type(env.task)(env.spec, replace(env.task.setup, grasps=None))
 
 
-def test_a_site_that_the_scene_lacks_is_named(tmp_path):
+def test_an_unknown_site_is_named(tmp_path):
     with pytest.raises(SimulationError, match='the scene has no site "point"'):
         pincer_env(tmp_path, 2, overrides={"tip": "point"})
 
 
 @pytest.mark.slow
-def test_the_hand_holds_the_screwdriver_without_an_action():
-    """With all that is random: for five seconds nine in ten stand, and nothing turns by itself."""
+def test_the_hand_holds_the_screwdriver_without_actions():
+    """With all randomisation: nine in ten stand for five seconds, and none turns by itself."""
     env = TouchEnv(DOCUMENT, 16, threads=1, overrides={"touch": "none"})
     dropped = torch.zeros(16, dtype=torch.bool)
     for _ in range(200):
@@ -280,7 +280,7 @@ def test_the_hand_holds_the_screwdriver_without_an_action():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("touch", ["force_torque", "elastomer", "proximity", "force_taxel"])
-def test_kinds_of_touch_of_every_quantity_begin_with_the_same_grasps(touch):
+def test_all_kinds_of_touch_begin_with_a_grasp(touch):
     env = TouchEnv(DOCUMENT, 4, threads=1, overrides={"touch": touch, "resolution": "low", "grasps.num": 16})
     obs = env.reset(0)
     assert obs["tactile_sensors"].abs().amax(dim=1).gt(0).all() and env.now.link_force.norm(dim=2).gt(0.1).sum(dim=1).min() >= 3
@@ -291,15 +291,15 @@ def test_kinds_of_touch_of_every_quantity_begin_with_the_same_grasps(touch):
 
 @pytest.mark.slow
 def test_a_gait_spins_every_handle_the_right_way():
-    """What the examples bring, with all that is random: more than 2 rad/s on average, and most hold for three seconds."""
+    """The example's gait with all randomisation: over 2 rad/s on average, and most hold for three seconds."""
     gait = runpy.run_path(str(DOCUMENT.with_name("screwdriver_gait.py")))["gait"]
     env = TouchEnv(DOCUMENT, 16, threads=1, overrides={"touch": "none"})
-    obs, dropped, turned = env.reset(1), torch.zeros(16, dtype=torch.bool), torch.zeros(16)
+    obs, dropped, angle = env.reset(1), torch.zeros(16, dtype=torch.bool), torch.zeros(16)
     for _ in range(120):
         result = env.step(gait(env, obs))
         obs, dropped = result.obs, dropped | result.terminated
-        turned += torch.where(dropped, 0.0, env.task.rate.float() * env.control_step)
+        angle += torch.where(dropped, 0.0, env.task.rate.float() * env.control_step)
     assert dropped.sum() <= 8
-    rate = (turned / 3.0).view(-1, 4)  # one column per handle
+    rate = (angle / 3.0).view(-1, 4)  # one column per handle
     assert rate.mean() > 2.0 and (rate.mean(dim=0) > 0.8).all()
     env.close()
