@@ -1,4 +1,4 @@
-"""An emulated hand that no command may have moved, and serial ports that this computer seems to have."""
+"""An emulated hand that no command may move, and fake serial ports."""
 
 import pytest
 from faulty_lines import FaultyEmulator
@@ -15,7 +15,7 @@ ALLOWED = {Command.VERSION, Command.READ_REGISTER, Command.EXCHANGE}
 
 @pytest.fixture
 def emulator():
-    """A hand at rest; at the end, no request may have held a set-point that moves a joint."""
+    """Yield a hand at rest; at the end, require that no request would have moved a joint."""
     registers = {Register.SERIAL_NUMBER: b"X1-0042" + bytes(25), Register.NAME: b"\xff\x00", Register.SIDE: b"\x01"}
     hand = first_order_hand(forces=resting)
     hand.registers = registers
@@ -31,24 +31,24 @@ def emulator():
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch):
-    """Wait for replies as long as a busy computer may take: an emulated hand shares it with all other tests."""
+    """Wait longer for replies: the emulated hand shares a busy computer with other tests."""
     monkeypatch.setattr(driver, "SerialTiming", lambda: SerialTiming(reply_timeout_s=0.3))
 
 
 @pytest.fixture
 def plugged(monkeypatch):
-    """Say which serial ports this computer has."""
+    """Return a function that sets the serial ports of this computer."""
 
     def plug(*devices: str) -> None:
-        found = tuple(PortInfo(device, "an adapter" if i == 0 else "", "") for i, device in enumerate(devices))
-        monkeypatch.setattr(ports, "list_ports", lambda: found)
+        port_infos = tuple(PortInfo(device, "an adapter" if i == 0 else "", "") for i, device in enumerate(devices))
+        monkeypatch.setattr(ports, "list_ports", lambda: port_infos)
 
     return plug
 
 
 @pytest.fixture(autouse=True)
 def checked_often(monkeypatch):
-    """Look after each episode's length whether all have ended: those of the small task last 8 control steps."""
+    """Check for the end of evaluation every 8 control steps, an episode of the small task."""
     monkeypatch.setattr("tgdsl.rl.playing.evaluation.CHECK_INTERVAL", 8)
 
 

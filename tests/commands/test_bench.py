@@ -1,4 +1,4 @@
-"""`tgdsl bench`: what it prints and writes, and how it ends when a user got it wrong."""
+"""`tgdsl bench`: output, files and error messages."""
 
 import pytest
 from benched_pads import bench_document
@@ -9,15 +9,15 @@ FEW = ("--steps", "6", "--state-envs", "2", "--repeats", "1", "--envs", "2,3", "
 @pytest.mark.slow
 def test_bench_prints_a_table_and_writes_three_files(here, tmp_path):
     bench_document(tmp_path)
-    code, said, error = here(tmp_path, "bench", "pad.yaml", "-o", "out", "--save-states", "states.npz", *FEW)
+    code, output, error = here(tmp_path, "bench", "pad.yaml", "-o", "out", "--save-states", "states.npz", *FEW)
     assert code == 0, error
-    assert "depth (contact_depth), against as written, float64\n" in said
-    assert "ms, 2 envs" in said and "ms, 3 envs" in said and "now" in said and "●" in said
-    assert said.endswith("out/bench.csv\nout/bench.json\nout/bench.html\n")
+    assert "depth (contact_depth), against as written, float64\n" in output
+    assert "ms, 2 envs" in output and "ms, 3 envs" in output and "now" in output and "●" in output
+    assert output.endswith("out/bench.csv\nout/bench.json\nout/bench.html\n")
     assert {file.name for file in (tmp_path / "out").iterdir()} == {"bench.csv", "bench.json", "bench.html"}
-    code, said, error = here(tmp_path, "bench", "pad.yaml", "-o", "again", "--states", "states.npz", *FEW)
+    code, output, error = here(tmp_path, "bench", "pad.yaml", "-o", "again", "--states", "states.npz", *FEW)
     assert code == 0, error
-    assert said.startswith("pad.yaml: states.npz: 6 steps in 2 environments\n")
+    assert output.startswith("pad.yaml: states.npz: 6 steps in 2 environments\n")
 
 
 @pytest.mark.parametrize(
@@ -32,27 +32,31 @@ def test_bench_prints_a_table_and_writes_three_files(here, tmp_path):
         (("--set", "sensors.depth.gate=open"), None),
     ],
 )
-def test_mistakes_end_in_their_message(here, tmp_path, arguments, message):
+def test_wrong_arguments_are_refused(here, tmp_path, arguments, message):
     bench_document(tmp_path)
-    code, said, error = here(tmp_path, "bench", "pad.yaml", *arguments)
-    assert code == 2 and not said
+    code, output, error = here(tmp_path, "bench", "pad.yaml", *arguments)
+    assert code == 2 and not output
     assert message is None or error.startswith(message)
     assert not (tmp_path / "report").exists()
 
 
-def test_without_a_document_there_are_oracles_and_hard_cases(here, tmp_path, monkeypatch):
+def test_oracles_and_hard_cases_need_no_document(here, tmp_path, monkeypatch):
     from oracles import filters, report
 
     for name, function in (("CASES", "filters.maxwell_step()"), ("HARD", "contacts.first_reading()")):
         monkeypatch.setattr(report, name, [case for case in getattr(report, name) if case.name == function])
-    code, said, error = here(tmp_path, "bench", "--oracles", "--hard", "-o", "out")
+    code, output, error = here(tmp_path, "bench", "--oracles", "--hard", "-o", "out")
     assert code == 0, error
-    assert "Maxwell branch: after a step" in said and "the first reading of filters" in said and said.count("1 of 1 hold") == 2
+    assert (
+        "Maxwell branch: after a step" in output
+        and "the first reading of filters" in output
+        and output.count("1 of 1 hold") == 2
+    )
     names = {f"{stem}.{suffix}" for stem in ("oracles", "hard") for suffix in ("csv", "json", "html")}
     assert {file.name for file in (tmp_path / "out").iterdir()} == names
-    monkeypatch.setattr(filters, "STRENGTH", 0.6)  # the closed form's; the noise is that of the default
-    code, said, error = here(tmp_path, "bench", "--oracles", "-o", "out")
-    assert code == 2 and error == "tgdsl: 1 results are not as they should be; they are marked in out\n" and "✗" in said
+    monkeypatch.setattr(filters, "STRENGTH", 0.6)  # only in the closed form
+    code, output, error = here(tmp_path, "bench", "--oracles", "-o", "out")
+    assert code == 2 and error == "tgdsl: 1 results are not as they should be; they are marked in out\n" and "✗" in output
 
 
 def test_an_installed_package_says_that_oracles_need_a_clone(here, tmp_path, monkeypatch):
@@ -60,8 +64,8 @@ def test_an_installed_package_says_that_oracles_need_a_clone(here, tmp_path, mon
 
     monkeypatch.setattr(report, "__file__", str(tmp_path / "site-packages" / "tgdsl" / "commands" / "report.py"))
     for option in ("--oracles", "--hard"):
-        code, said, error = here(tmp_path, "bench", option)
-        assert code == 2 and not said
+        code, output, error = here(tmp_path, "bench", option)
+        assert code == 2 and not output
         assert error == (
             "tgdsl: bench --oracles and --hard run tgdsl's tests, which an installed package does not contain: in a clone of the "
             "repository, run `pip install -e .` and then the command again\n"
@@ -76,7 +80,7 @@ def test_an_installed_package_says_that_oracles_need_a_clone(here, tmp_path, mon
         (("pad.yaml", "--hard"), "tgdsl: bench pad.yaml: --oracles and --hard need no document, expected one or the other\n"),
     ],
 )
-def test_a_document_or_neither(here, tmp_path, arguments, message):
+def test_a_document_excludes_oracles_and_hard_cases(here, tmp_path, arguments, message):
     bench_document(tmp_path)
-    code, said, error = here(tmp_path, "bench", *arguments)
-    assert (code, said, error) == (2, "", message)
+    code, output, error = here(tmp_path, "bench", *arguments)
+    assert (code, output, error) == (2, "", message)

@@ -22,7 +22,7 @@ PRESSES = np.array([[0, 0, 0], [1, 0, 0], [0, 1.5, 0], [0, 0, -2], [1, 1, -3], [
 
 @pytest.fixture(scope="module")
 def pressed(tmp_path_factory):
-    """A log of an index finger that is pressed in steps, and what `--load` says of them."""
+    """Return a folder with a log of an index finger pressed in steps, and its `--load` arguments."""
     folder = tmp_path_factory.mktemp("pressed")
     now = np.zeros(3)
 
@@ -41,7 +41,7 @@ def pressed(tmp_path_factory):
         log.add(first)
         for press in PRESSES:
             now[:] = press
-            hand.read(20.0)  # may have been asked for before
+            hand.read(20.0)  # may be of an earlier request
             times = []
             for _ in range(12):
                 reading = hand.read(20.0)
@@ -55,14 +55,14 @@ def pressed(tmp_path_factory):
 def test_the_help_names_the_fingers(capsys):
     with pytest.raises(SystemExit):
         tyro.cli(CalibrateHand, args=["--help"])
-    shown = capsys.readouterr().out
-    assert all(f"{option} {{thumb,index,middle,ring,pinky}}" in shown for option in ("--finger", "--others"))
+    output = capsys.readouterr().out
+    assert all(f"{option} {{thumb,index,middle,ring,pinky}}" in output for option in ("--finger", "--others"))
 
 
 def test_calibrate_with_loads(pressed, here, tmp_path):
     folder, loads = pressed
     log = str(folder / "press.npz")
-    code, said, error = here(
+    code, output, error = here(
         tmp_path, "calibrate", "hand", "--log", log, "--finger", "index", *loads, "--others", "index", "-o", "out/hand.yaml"
     )
     assert code == 0, error
@@ -74,8 +74,8 @@ def test_calibrate_with_loads(pressed, here, tmp_path):
     text = (tmp_path / "out" / "hand.yaml").read_text()
     assert text.startswith("# index: fitted to press.npz; scale 0.05000 0.05000 0.02000 N per count, ")
     assert "# ring: not loaded; scale and rotation as for index\n" in text
-    assert said.splitlines()[0].startswith(f"index: {12 * len(PRESSES)} readings; scale 0.05000")
-    assert said.splitlines()[-2:] == ["calibration: out/hand.yaml", "picture:     hand.calibration.png"]
+    assert output.splitlines()[0].startswith(f"index: {12 * len(PRESSES)} readings; scale 0.05000")
+    assert output.splitlines()[-2:] == ["calibration: out/hand.yaml", "picture:     hand.calibration.png"]
     assert (tmp_path / "hand.calibration.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -99,7 +99,7 @@ def test_calibrate_with_a_file_of_loads(pressed, here, tmp_path):
 
 @pytest.mark.slow
 def test_calibrate_with_forces_over_time(here, tmp_path):
-    """The counts follow a force that another clock, 0.3 s behind, says; the fit finds scale, axes and offset."""
+    """Counts follow a force with a clock that is 0.3 s behind; the fit finds scale, axes and offset."""
 
     def force_at(seconds):
         press = np.maximum(np.sin(9 * seconds) + 0.5 * np.sin(23 * seconds + 1), 0)
@@ -126,11 +126,11 @@ def test_calibrate_with_forces_over_time(here, tmp_path):
     forces[:, 3] = force_at(steps + late + 0.3)
     np.savez(tmp_path / "known.npz", time=steps + 0.3, tip_force=forces)
     arguments = ("--simulation", "known.npz", "--others", "ring")
-    code, said, error = here(tmp_path, "calibrate", "hand", "--log", "a.npz", *arguments)
+    code, output, error = here(tmp_path, "calibrate", "hand", "--log", "a.npz", *arguments)
     assert code == 0, error
-    first = said.splitlines()[0].split()
-    assert said.splitlines()[0].endswith("fingertips with loads: ring")
-    # A state is of the moment when the request has arrived, which is a millisecond or more after it was sent.
+    first = output.splitlines()[0].split()
+    assert output.splitlines()[0].endswith("fingertips with loads: ring")
+    # A state is measured when its request arrives, at least a millisecond after it was sent.
     assert float(first[4]) == pytest.approx(-0.3, abs=0.02)
     calibration = load_calibration(tmp_path / "hand.calibration.yaml")
     assert calibration.scale[3] == pytest.approx(SCALE, rel=0.1)
@@ -161,8 +161,8 @@ sensors: {skin: {kind: kinematic_taxel, links: "*", feels: [cube], outputs: [for
 
 
 @pytest.mark.slow
-def test_calibrate_beside_a_simulation(here, tmp_path):
-    """A log of the same forces as the readings of a run, 70 ms later, as counts of a ring finger with other axes."""
+def test_calibrate_with_a_simulation(here, tmp_path):
+    """A ring finger with other axes logs the forces of a simulated run 70 ms later, as counts."""
     (tmp_path / "scene.xml").write_text(SCENE)
     (tmp_path / "hand.yaml").write_text(DOCUMENT)
     steps = 0.01 * np.arange(1, 400)
@@ -180,11 +180,11 @@ def test_calibrate_beside_a_simulation(here, tmp_path):
             state = replace(reading.state, total_force=np.round(total).astype(np.int16), taxel_force=quiet)
             log.add(replace(reading, state=state))
     arguments = ("--simulation", "readings.npz", "--document", "hand.yaml", "--reading", "skin", "--others", "ring")
-    code, said, error = here(tmp_path, "calibrate", "hand", "--log", "a.npz", *arguments)
+    code, output, error = here(tmp_path, "calibrate", "hand", "--log", "a.npz", *arguments)
     assert code == 0, error
-    # The log counts from its first reading, the run from 10 ms before; and what is read was asked for 8 ms earlier.
-    assert float(said.split()[4]) == pytest.approx(-0.01 - 0.008, abs=1e-3)
-    assert said.splitlines()[0].endswith("fingertips with loads: ring")
+    # The log starts at its first reading, the run 10 ms earlier; readings were requested 8 ms before they arrived.
+    assert float(output.split()[4]) == pytest.approx(-0.01 - 0.008, abs=1e-3)
+    assert output.splitlines()[0].endswith("fingertips with loads: ring")
     calibration = load_calibration(tmp_path / "hand.calibration.yaml")
     assert calibration.scale[3] == pytest.approx(SCALE, rel=0.01)
     assert calibration.rotation[3] == pytest.approx(TURN, abs=0.01)
@@ -193,7 +193,7 @@ def test_calibrate_beside_a_simulation(here, tmp_path):
     assert (code, error) == (2, 'tgdsl: the document has no reading "touch"; it has skin\n')
 
 
-def test_calibrations_that_cannot_be(pressed, here, tmp_path):
+def test_impossible_calibrations_are_refused(pressed, here, tmp_path):
     folder, loads = pressed
     log = str(folder / "press.npz")
     (tmp_path / "there.yaml").write_text("")

@@ -1,4 +1,4 @@
-"""The command line, as users run it: what it prints, what it writes, and how it ends."""
+"""The command line as users run it: output, files and exit codes."""
 
 import json
 import os
@@ -47,7 +47,7 @@ observations:
 
 @pytest.fixture(scope="module")
 def base(tmp_path_factory):
-    """A folder with a document and its compiled artefact."""
+    """Return a folder with a document and its compiled artefact."""
     folder = tmp_path_factory.mktemp("cli")
     (folder / "scene.xml").write_text(SCENE)
     (folder / "pad.yaml").write_text(DOCUMENT)
@@ -65,7 +65,7 @@ main()
 
 @pytest.fixture
 def fails(here):
-    """Run a command that a user got wrong; return what it says."""
+    """Return a function that runs a wrong command and returns its message."""
 
     def run(folder: Path, *arguments: str) -> str:
         code, _, message = here(folder, *arguments)
@@ -78,12 +78,12 @@ def fails(here):
 # compile
 
 
-def test_compile_says_what_it_made(base, tmp_path, here):
+def test_compile_prints_a_summary(base, tmp_path, here):
     for name in ("scene.xml", "pad.yaml"):
         shutil.copy(base / name, tmp_path)
-    code, said, error = here(tmp_path, "compile", "pad.yaml")
+    code, printed, error = here(tmp_path, "compile", "pad.yaml")
     assert (code, error) == (0, "")
-    lines = said.splitlines()
+    lines = printed.splitlines()
     assert lines[:2] == ["6 taxels on 1 links at resolution low", "sensors: touch (kinematic_taxel, 6), bit (contact, 6)"]
     assert lines[2].startswith(f"pad.safetensors: {(tmp_path / 'pad.safetensors').stat().st_size} bytes in ")
     assert [output.name for output in tgdsl.load(tmp_path / "pad.safetensors").outputs] == ["touch", "bit"]
@@ -92,9 +92,9 @@ def test_compile_says_what_it_made(base, tmp_path, here):
 def test_compile_with_overrides_into_a_new_folder(base, tmp_path, here):
     out = tmp_path / "new" / "folder" / "pad.safetensors"
     arguments = ("--set", "resolution=high", "--set", "sensors.touch.normal_stiffness=400", "-o", str(out))
-    code, said, error = here(base, "compile", "pad.yaml", *arguments)
+    code, output, error = here(base, "compile", "pad.yaml", *arguments)
     assert code == 0, error
-    assert said.startswith("16 taxels on 1 links at resolution high\n")
+    assert output.startswith("16 taxels on 1 links at resolution high\n")
     plan = tgdsl.load(out).plan
     assert 400.0 in [
         float(value) for name, value in plan.arrays.items() if name.startswith("sensors/touch/") and value.size == 1
@@ -114,17 +114,17 @@ def test_compile_with_overrides_into_a_new_folder(base, tmp_path, here):
         ("tgdsl.x=3", "--set tgdsl.x=3: tgdsl.x: does not lead to a key of a mapping\n1 mistake\n"),
     ],
 )
-def test_bad_overrides(base, fails, argument, message):
+def test_wrong_overrides_are_refused(base, fails, argument, message):
     assert fails(base, "compile", "pad.yaml", "--set", argument).endswith(message)
 
 
-def test_a_resolution_is_set(base, fails):
+def test_resolution_is_an_override_not_an_option(base, fails):
     message = "tgdsl: --resolution{}: there is no such option; write --set resolution=high\n"
     assert fails(base, "compile", "pad.yaml", "--resolution", "high") == message.format("")
     assert fails(base, "compile", "pad.yaml", "--resolution=3") == message.format("=3")
 
 
-def test_documents_that_cannot_be_read(base, tmp_path, fails):
+def test_unreadable_documents_are_reported(base, tmp_path, fails):
     assert fails(base, "compile", "none.yaml") == "none.yaml: cannot read this file: No such file or directory\n1 mistake\n"
     (tmp_path / "scene.xml").write_text("<mujoco><worldbody><geo/></worldbody></mujoco>")
     (tmp_path / "pad.yaml").write_text(DOCUMENT)
@@ -134,7 +134,7 @@ def test_documents_that_cannot_be_read(base, tmp_path, fails):
     assert not list(tmp_path.glob("*.safetensors"))
 
 
-def test_files_that_cannot_be_written(base, tmp_path, fails):
+def test_unwritable_files_are_reported(base, tmp_path, fails):
     (tmp_path / "file").write_text("")
     assert fails(base, "compile", "pad.yaml", "-o", str(tmp_path / "file" / "x.safetensors")).startswith("tgdsl: ")
     assert (
@@ -143,7 +143,7 @@ def test_files_that_cannot_be_written(base, tmp_path, fails):
     )
 
 
-def test_commands_that_do_not_exist(base, fails):
+def test_unknown_commands_list_the_known_ones(base, fails):
     for arguments in (("compil",), ()):
         assert "compile, explain, schema, run" in fails(base, *arguments)
 
@@ -155,8 +155,8 @@ def test_explain_of_document_and_artefact(base, here):
     explained = tgdsl.load(base / "pad.safetensors").explain() + "\n"
     assert here(base, "explain", "pad.safetensors") == (0, explained, "")
     assert here(base, "explain", "pad.yaml") == (0, explained, "")
-    said = here(base, "explain", "pad.yaml", "--set", "resolution=high")[1]
-    assert "asks for depth of 16 probes (query 0)" in said and " in cube (box), " in said
+    output = here(base, "explain", "pad.yaml", "--set", "resolution=high")[1]
+    assert "asks for depth of 16 probes (query 0)" in output and " in cube (box), " in output
 
 
 def test_an_artefact_cannot_be_overridden(base, fails):
@@ -164,7 +164,7 @@ def test_an_artefact_cannot_be_overridden(base, fails):
     assert fails(base, "explain", "pad.safetensors", "--set", "resolution=high") == message
 
 
-def test_a_damaged_artefact(base, tmp_path, fails):
+def test_a_damaged_artefact_is_reported(base, tmp_path, fails):
     (tmp_path / "x.safetensors").write_bytes((base / "pad.safetensors").read_bytes()[:-5])
     assert fails(tmp_path, "explain", "x.safetensors").startswith("tgdsl: x.safetensors: cannot read this artefact: ")
 
@@ -172,10 +172,10 @@ def test_a_damaged_artefact(base, tmp_path, fails):
 # schema
 
 
-def test_schema_in_the_repository_is_the_one_of_the_code():
-    kept = (REPOSITORY / "tgdsl.schema.json").read_text(encoding="utf-8")
-    assert json.loads(kept) == json_schema(), "run `tgdsl schema`"
-    assert kept == json.dumps(json_schema(), indent=2, ensure_ascii=False) + "\n"
+def test_schema_in_the_repository_is_current():
+    committed = (REPOSITORY / "tgdsl.schema.json").read_text(encoding="utf-8")
+    assert json.loads(committed) == json_schema(), "run `tgdsl schema`"
+    assert committed == json.dumps(json_schema(), indent=2, ensure_ascii=False) + "\n"
 
 
 def test_schema_command(tmp_path, here):
@@ -187,13 +187,13 @@ def test_schema_command(tmp_path, here):
 
 
 @pytest.mark.slow
-def test_run(base, tmp_path):
-    """In a new process, which shows each warning."""
+def test_run_prints_and_writes_readings(base, tmp_path):
+    """A new process shows every warning."""
     environment = {**os.environ, "PYTHONWARNINGS": "default", "PYTHONPATH": str(REPOSITORY), "NO_COLOR": "1", "COLUMNS": "200"}
     command = [sys.executable, "-c", WITHOUT_PROGRESS, "run", "pad.yaml", "--seconds", "0.1", "--out", str(tmp_path / "out")]
-    ran = subprocess.run(command, cwd=base, env=environment, capture_output=True, text=True, check=False)
-    assert (ran.returncode, ran.stderr) == (0, "")
-    lines = ran.stdout.splitlines()
+    process = subprocess.run(command, cwd=base, env=environment, capture_output=True, text=True, check=False)
+    assert (process.returncode, process.stderr) == (0, "")
+    lines = process.stdout.splitlines()
     assert lines[0] == "t = 0.30 s"
     assert lines[1].split() == ["link", "touch", "[N]", "bit", "[taxels]"]
     assert lines[3].split()[0] == "pad"
@@ -226,7 +226,7 @@ def test_run_recorded_controls(base, tmp_path, here):
         np.testing.assert_allclose(archive["time"], [0.02, 0.04, 0.06, 0.08])
 
 
-def test_bad_runs(base, tmp_path, fails):
+def test_wrong_runs_are_refused(base, tmp_path, fails):
     np.savez(tmp_path / "two.npz", ctrl=np.zeros((3, 2)))
     cases = {
         ("--keyframes", "rest", "sqeeze"): 'tgdsl: the scene has no keyframe "sqeeze"; did you mean "squeeze"?\n',
@@ -242,7 +242,7 @@ def test_bad_runs(base, tmp_path, fails):
 
 @pytest.mark.usefixtures("no_pictures")
 def test_run_closes_a_hand_without_keyframes(here, tmp_path):
-    """From a robot file to touch by three commands; the artefact needs the file no more."""
+    """Three commands lead from a robot file to touch; the artefact does not need the file."""
     (tmp_path / "my hand.urdf").write_text(URDF)
     (tmp_path / "hand.yaml").write_text(
         "tgdsl: 1\nrobot: {model: my hand.urdf, layout: layout.yaml}\nresolution: low\n"
@@ -252,17 +252,17 @@ def test_run_closes_a_hand_without_keyframes(here, tmp_path):
     assert here(tmp_path, "layout", "new", "my hand.urdf")[0] == 0
     assert here(tmp_path, "compile", "hand.yaml")[0] == 0
     (tmp_path / "my hand.urdf").unlink()
-    code, out, said = here(tmp_path, "run", "hand.safetensors", "--seconds", "0.8", "--num-envs", "2", "--out", "closed")
-    assert code == 0, said
+    code, out, output = here(tmp_path, "run", "hand.safetensors", "--seconds", "0.8", "--num-envs", "2", "--out", "closed")
+    assert code == 0, output
     assert out.startswith(
         "no keyframes rest and squeeze: the hand closes on `ball`, put between the fingers, without gravity; 3 of 3 joints\n"
     )
-    with np.load(tmp_path / "closed" / "readings.npz") as kept:
-        forces = np.linalg.norm(kept["touch"][..., 1:], axis=-1)
-        assert kept["ctrl"].shape == (len(forces), 3) and np.isfinite(forces).all()
+    with np.load(tmp_path / "closed" / "readings.npz") as archive:
+        forces = np.linalg.norm(archive["touch"][..., 1:], axis=-1)
+        assert archive["ctrl"].shape == (len(forces), 3) and np.isfinite(forces).all()
         assert not forces[0].any() and ((forces[-1] > 0).sum(axis=-1) >= 2).all()
-    code, _, said = here(tmp_path, "run", "hand.safetensors", "--controls", "closed/readings.npz", "--out", "again")
-    assert code == 2 and "closed/readings.npz: its controls are of servos that `tgdsl run` added to close the hand" in said
+    code, _, output = here(tmp_path, "run", "hand.safetensors", "--controls", "closed/readings.npz", "--out", "again")
+    assert code == 2 and "closed/readings.npz: its controls are of servos that `tgdsl run` added to close the hand" in output
 
 
 @pytest.mark.usefixtures("no_pictures")
@@ -271,17 +271,17 @@ def test_run_holds_a_scene_without_keyframes(here, tmp_path):
     (tmp_path / "scene.xml").write_text(SCENE[:start] + SCENE[end:])
     (tmp_path / "pad.yaml").write_text(DOCUMENT)
     code, out, _ = here(tmp_path, "run", "pad.yaml", "--seconds", "0.1", "--out", "held")
-    why = "no keyframes rest and squeeze, and the hand does not close (it has no hinge and no slide)"
-    assert code == 0 and f"{why}: its initial state is held for 0.1 s\n" in out
-    with np.load(tmp_path / "held" / "readings.npz") as kept:
-        assert kept["touch"].shape[0] == 10
+    reason = "no keyframes rest and squeeze, and the hand does not close (it has no hinge and no slide)"
+    assert code == 0 and f"{reason}: its initial state is held for 0.1 s\n" in out
+    with np.load(tmp_path / "held" / "readings.npz") as archive:
+        assert archive["touch"].shape[0] == 10
 
 
 @pytest.mark.parametrize(
     ("arguments", "format_"),
     [((), "pt2"), (("-o", "hand.onnx"), "onnx"), (("--to", "aoti"), "aoti"), (("-o", "hand.aoti.pt2"), "aoti")],
 )
-def test_an_export_has_the_format_of_its_ending(base, here, monkeypatch, arguments, format_):
+def test_the_suffix_sets_the_format_of_an_export(base, here, monkeypatch, arguments, format_):
     class Exported(Exception):
         pass
 

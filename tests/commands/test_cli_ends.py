@@ -1,4 +1,4 @@
-"""How commands end when something outside stops them: Ctrl-C, a reader that goes, a full disk, a path that cannot be."""
+"""Commands stopped from outside: Ctrl-C, a closed pipe, a full disk, invalid paths."""
 
 import os
 import resource
@@ -52,12 +52,12 @@ def base(tmp_path):
     return tmp_path
 
 
-def ended(folder, arguments, out):
-    """Run a command in a process of its own, whose exit flushes its output; return exit code and errors."""
+def run_process(folder, arguments, out):
+    """Run a command in a process, whose exit flushes its output; return exit code and stderr."""
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "NO_COLOR": "1", "COLUMNS": "200"}
     command = [sys.executable, "-m", "tgdsl", *arguments]
-    ran = subprocess.run(command, cwd=folder, env=environment, stdout=out, stderr=subprocess.PIPE, text=True, check=False)
-    return ran.returncode, ran.stderr
+    process = subprocess.run(command, cwd=folder, env=environment, stdout=out, stderr=subprocess.PIPE, text=True, check=False)
+    return process.returncode, process.stderr
 
 
 def files_in(folder):
@@ -69,7 +69,7 @@ def files_in(folder):
 
 @pytest.mark.parametrize("where", ["stepping", "writing"])
 def test_ctrl_c_ends_cleanly(base, here, monkeypatch, where):
-    """Nothing half written is left, and what was there is."""
+    """No partial files remain, and old files stay."""
     (base / "out").mkdir()
     (base / "out" / "readings.npz").write_bytes(b"before")
 
@@ -82,32 +82,32 @@ def test_ctrl_c_ends_cleanly(base, here, monkeypatch, where):
         monkeypatch.setattr(BatchSimulation, "step", interrupted)
     else:
         monkeypatch.setattr(np, "savez_compressed", interrupted)
-    before = files_in(base)
+    files_before = files_in(base)
     code, _, error = here(base, "run", "pad.yaml", "--seconds", "0.1")
     assert (code, error.splitlines()[-1]) == (130, "interrupted")
-    assert files_in(base) == before
+    assert files_in(base) == files_before
     assert (base / "out" / "readings.npz").read_bytes() == b"before"
 
 
-# A reader that goes
+# Closed pipes
 
 
 @pytest.mark.parametrize("arguments", [("examples", "list"), ("run", "--help"), ("--version",)])
-def test_a_reader_that_has_gone_before_the_first_line(tmp_path, arguments):
+def test_a_pipe_closed_before_the_first_line(tmp_path, arguments):
     reader, writer = os.pipe()
     os.close(reader)
     with os.fdopen(writer, "wb") as out:
-        assert ended(tmp_path, arguments, out) == (1, "")
+        assert run_process(tmp_path, arguments, out) == (1, "")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
 @pytest.mark.parametrize("arguments", [("examples", "list"), ("--version",)])
 def test_output_to_a_full_disk(tmp_path, arguments):
     with Path("/dev/full").open("wb") as full:
-        assert ended(tmp_path, arguments, full) == (2, "tgdsl: standard output: No space left on device\n")
+        assert run_process(tmp_path, arguments, full) == (2, "tgdsl: standard output: No space left on device\n")
 
 
-# Files that cannot be
+# Files that cannot be written
 
 
 @pytest.fixture
@@ -129,12 +129,12 @@ def limit_files(monkeypatch):
         (("import", "cube.usda"), "cube.xml"),
     ],
 )
-def test_a_file_that_grows_too_large_is_named_and_not_left(base, here, limit_files, arguments, file):
-    before = files_in(base)
+def test_a_file_that_grows_too_large_is_named_and_removed(base, here, limit_files, arguments, file):
+    files_before = files_in(base)
     limit_files(100)
     code, _, error = here(base, *arguments)
     assert (code, error.splitlines()[-1]) == (2, f"tgdsl: {file}: File too large")
-    assert files_in(base) == before
+    assert files_in(base) == files_before
 
 
 def test_a_picture_that_grows_too_large(base, here, limit_files):
@@ -158,19 +158,19 @@ def test_a_picture_that_grows_too_large(base, here, limit_files):
         (("schema", "-o", "made"), "made: this is a folder, expected a file's name"),
     ],
 )
-def test_a_wrong_path_is_found_before_the_work(base, here, monkeypatch, arguments, message):
+def test_a_wrong_path_is_refused_before_the_work(base, here, monkeypatch, arguments, message):
     (base / "made" / "picture.png").mkdir(parents=True)
-    monkeypatch.setattr("tgdsl.compiler.pipeline.compile_document", None)  # nothing is compiled, let alone stepped
-    before = sorted(base.rglob("*"))
+    monkeypatch.setattr("tgdsl.compiler.pipeline.compile_document", None)  # nothing may be compiled
+    files_before = sorted(base.rglob("*"))
     code, _, error = here(base, *arguments)
     assert (code, error) == (2, f"tgdsl: {message.format(base=base)}\n")
-    assert sorted(base.rglob("*")) == before
+    assert sorted(base.rglob("*")) == files_before
 
 
 # Controls
 
 
-def test_a_bad_control_is_named_by_its_place(base, here):
+def test_an_invalid_control_is_named_by_its_index(base, here):
     controls = np.zeros((5, 2, 1))
     controls[3, 1, 0] = np.nan
     controls[4] = np.inf
@@ -181,7 +181,7 @@ def test_a_bad_control_is_named_by_its_place(base, here):
 
 def test_a_step_that_fails_is_named(base, here):
     controls = np.zeros((5, 2, 1))
-    controls[3, 1] = 9e9  # on 0.25 kg: beyond the acceleration that MuJoCo takes
+    controls[3, 1] = 9e9  # on 0.25 kg: beyond the accelerations that MuJoCo accepts
     np.savez(base / "c.npz", ctrl=controls)
     code, _, error = here(base, "run", "pad.yaml", "--controls", "c.npz", "--num-envs", "2")
     assert code == 2
@@ -189,7 +189,7 @@ def test_a_step_that_fails_is_named(base, here):
     assert not (base / "out").exists()
 
 
-def test_readings_beyond_all_memory(base, here):
+def test_readings_beyond_memory_are_refused(base, here):
     code, _, error = here(base, "run", "pad.yaml", "--num-envs", "1000", "--seconds", "1e5")
     assert code == 2
     assert error.startswith("tgdsl: readings of 1000 environments at 10000000 steps need about ")

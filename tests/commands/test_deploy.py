@@ -21,8 +21,8 @@ def base(tmp_path):
 
 
 @pytest.mark.slow
-def test_on_a_simulation_and_behind_the_line(base, here):
-    """The same score; what was written is what was done."""
+def test_simulation_and_emulator_give_the_same_score(base, here):
+    """The record matches the printed score."""
     scores = []
     for source in (["simulation"], ["emulator", "--lockstep", "--calibration", "hand.yaml"]):
         arguments = ("--policy", "student.pt", "--seconds", "0.2", "--goal", "1", "--out", "a b/made.npz")
@@ -32,18 +32,18 @@ def test_on_a_simulation_and_behind_the_line(base, here):
         assert lines[0].startswith("score ") and lines[0].endswith(" rad, 100.0% of full length; 1 episode, 10 control steps")
         assert lines[1].startswith("inference ") and lines[1].endswith("of 50.0 control steps per second, not in real time")
         assert lines[-1] == "record: a b/made.npz" and len(lines) == 2 + 2 + 6 + 1
-        with np.load(base / "a b" / "made.npz") as found:
-            assert found["obs:tactile_sensors"].shape == (10, 15) and (found["obs:goal"] == 1).all()
-            assert np.isnan(found["age"]).all() and found["joints"].shape == (6,)
-            wanted = found["target"][:-1] + 0.8 * 0.05 * found["action"][1:]
-            np.testing.assert_allclose(found["target"][1:], wanted, atol=1e-7)
-            scores.append(f"{found['score'][-1]:.4f}")
+        with np.load(base / "a b" / "made.npz") as record:
+            assert record["obs:tactile_sensors"].shape == (10, 15) and (record["obs:goal"] == 1).all()
+            assert np.isnan(record["age"]).all() and record["joints"].shape == (6,)
+            expected = record["target"][:-1] + 0.8 * 0.05 * record["action"][1:]
+            np.testing.assert_allclose(record["target"][1:], expected, atol=1e-7)
+            scores.append(f"{record['score'][-1]:.4f}")
         assert lines[0].split()[1] == scores[-1]
     assert scores[0] == scores[1]
 
 
-def test_what_of_the_task_is_otherwise_is_told(base, here):
-    """All but what the user asks for, which is no change of the task."""
+def test_changes_of_the_task_are_printed(base, here):
+    """Goals that the user gives are no changes."""
     arguments = ("--policy", "student.pt", "--seconds", "0.1", "--goal", "1", "--set", "randomise.drive.delay=[0, 1]")
     code, out, error = here(base, "deploy", "task.yaml", *arguments)
     assert code == 0, error
@@ -52,7 +52,7 @@ def test_what_of_the_task_is_otherwise_is_told(base, here):
     assert second.startswith("score ")
 
 
-def test_on_a_log(base, here):
+def test_a_log_is_played_without_a_score(base, here):
     write_log(base / "press.npz", random_readings(1.0 + 0.02 * np.arange(8)))
     arguments = ("--policy", "student.pt", "--source", "press.npz", "--lockstep", "--goal", "1", "--calibration", "hand.yaml")
     code, out, error = here(base, "deploy", "task.yaml", *arguments)
@@ -61,7 +61,7 @@ def test_on_a_log(base, here):
     assert "press.npz was not moved: actions were computed, and went nowhere\n" in out
 
 
-def test_what_was_done_until_ctrl_c_is_told(base, here, monkeypatch):
+def test_ctrl_c_keeps_the_record_so_far(base, here, monkeypatch):
     steps = Deployment.steps
 
     def interrupted(self, *arguments):
@@ -73,11 +73,11 @@ def test_what_was_done_until_ctrl_c_is_told(base, here, monkeypatch):
     assert code == 0, error
     first, second, *_ = out.splitlines()
     assert first == "interrupted" and second.endswith("no episode has ended; 0 episodes, 3 control steps")
-    with np.load(base / "made.npz") as found:
-        assert found["action"].shape == (3, 6)
+    with np.load(base / "made.npz") as record:
+        assert record["action"].shape == (3, 6)
 
 
-def test_mistakes(base, here):
+def test_wrong_arguments_are_refused(base, here):
     card = json.loads((base / "student.json").read_text())
     assert card["spec"]["touch"] == "agg_force"
     policy = ("--policy", "student.pt")

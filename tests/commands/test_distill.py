@@ -38,7 +38,7 @@ def rows_of(file):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """A folder with a task of two resolutions and a teacher."""
+    """Return a folder with a task of two resolutions and a teacher."""
     folder = tmp_path_factory.mktemp("task")
     task = felt_task(folder)
     sensors = (folder / "sensors.yaml").read_text()
@@ -56,20 +56,20 @@ def base(written, tmp_path):
 
 @pytest.fixture
 def fails(here, base):
-    """Run a command that a user got wrong; return what it says. Nothing is written."""
+    """Return a function that runs a wrong command and returns its message; it must write nothing."""
 
     def run(*arguments):
-        before = sorted(base.rglob("*"))
+        files_before = sorted(base.rglob("*"))
         code, out, message = here(base, "distill", "task.yaml", *arguments)
         assert (code, out) == (2, ""), message
-        assert sorted(base.rglob("*")) == before
+        assert sorted(base.rglob("*")) == files_before
         return message
 
     return run
 
 
 def test_from_a_teacher_to_students_that_play(base, here):
-    """A student's file evaluates in environments of its own task; a run goes on with the same students."""
+    """A student's file can be evaluated in its task; a resumed run has the same students."""
     arguments = ("--envs", "10", "--iterations", "2", "--episodes", "2", *SMALL)
     code, out, error = here(base, "distill", "task.yaml", *TEACHER, *FIVE, *arguments)
     assert code == 0, error
@@ -105,9 +105,9 @@ def test_from_a_teacher_to_students_that_play(base, here):
     assert code == 2 and "--types none: this run began with depth,bool,none; begin another one" in error
 
 
-def test_a_run_goes_on_as_it_began_and_says_what_has_changed(base, here, monkeypatch):
-    """The number of environments is kept, not made again; what students feel cannot be changed; old scores do not stay."""
-    few = (
+def test_a_resumed_run_keeps_its_settings_and_prints_changes(base, here, monkeypatch):
+    """It keeps the number of environments; sensing cannot change; old scores are removed."""
+    arguments = (
         *TEACHER,
         "--types",
         "none",
@@ -124,18 +124,18 @@ def test_a_run_goes_on_as_it_began_and_says_what_has_changed(base, here, monkeyp
         "placement=ends",
     )
     monkeypatch.setattr("tgdsl.commands.distill.ENVS", 6)
-    assert here(base, "distill", "task.yaml", *few)[0] == 0
+    assert here(base, "distill", "task.yaml", *arguments)[0] == 0
     assert json.loads((base / "run" / "distill.json").read_text())["envs"] == 6
     monkeypatch.setattr("tgdsl.commands.distill.ENVS", 8)
-    on = ("--resume", "run", "--device", "cpu", "--iterations", "2", "--episodes", "0")
+    resume = ("--resume", "run", "--device", "cpu", "--iterations", "2", "--episodes", "0")
     for key in ("resolution=high", "placement=all", "noise=noisy"):
-        code, out, error = here(base, "distill", "task.yaml", *on, "--set", key)
+        code, out, error = here(base, "distill", "task.yaml", *resume, "--set", key)
         assert (code, out) == (2, "") and f"--set {key}: what students feel stays as it is in a run that goes on" in error
     teacher(base / "teacher.pt", load_task(base / "task.yaml"), ["priv_proprio"])
-    code, out, error = here(base, "distill", "task.yaml", *on, "--set", "rewards.spin=3", "--set", "placement=ends")
+    code, out, error = here(base, "distill", "task.yaml", *resume, "--set", "rewards.spin=3", "--set", "placement=ends")
     assert code == 0, error
-    told = [line for line in out.splitlines() if line.startswith("changed since the run began")]
-    assert told == [
+    changes = [line for line in out.splitlines() if line.startswith("changed since the run began")]
+    assert changes == [
         "changed since the run began: rewards.spin: 2.0, now 3.0",
         "changed since the run began: the teacher's file",
     ]
@@ -143,114 +143,114 @@ def test_a_run_goes_on_as_it_began_and_says_what_has_changed(base, here, monkeyp
     assert not (base / "run" / "table.csv").exists() and not (base / "run" / "default" / "evaluation.json").exists()
     for text in ("[]", '{"types": ["none"]}'):
         (base / "run" / "distill.json").write_text(text)
-        code, _, error = here(base, "distill", "task.yaml", *on)
+        code, _, error = here(base, "distill", "task.yaml", *resume)
         assert code == 2 and "distill.json: it has no teacher: this is not what tgdsl distill writes" in error
 
 
-def test_a_run_goes_on_with_its_teacher_wherever_that_is_now(base, here):
-    """It is told by its bytes."""
-    few = (*TEACHER, "--types", "none", "--seeds", "1", "--envs", "2", "--episodes", "0", *SMALL)
-    assert here(base, "distill", "task.yaml", *few, "--iterations", "1", "-o", "run")[0] == 0
+def test_a_resumed_run_accepts_a_moved_teacher(base, here):
+    """Its bytes identify it."""
+    arguments = (*TEACHER, "--types", "none", "--seeds", "1", "--envs", "2", "--episodes", "0", *SMALL)
+    assert here(base, "distill", "task.yaml", *arguments, "--iterations", "1", "-o", "run")[0] == 0
     (base / "sub").mkdir()
     (base / "teacher.pt").rename(base / "sub" / "moved.pt")
-    on = ("--resume", str(base / "run"), "--device", "cpu", "--episodes", "0", "--iterations")
-    code, _, error = here(base, "distill", "task.yaml", *on, "2")
+    resume = ("--resume", str(base / "run"), "--device", "cpu", "--episodes", "0", "--iterations")
+    code, _, error = here(base, "distill", "task.yaml", *resume, "2")
     assert code == 2 and "teacher.pt: cannot read this file" in error
-    code, _, error = here(base / "sub", "distill", "../task.yaml", *on, "2", "--teacher", "moved.pt")
+    code, _, error = here(base / "sub", "distill", "../task.yaml", *resume, "2", "--teacher", "moved.pt")
     assert code == 0, error
     assert json.loads((base / "run" / "distill.json").read_text())["teacher"] == "moved.pt"
     teacher(base / "teacher.pt", load_task(base / "task.yaml"), ["priv_proprio"])
-    code, _, error = here(base, "distill", "task.yaml", *on, "3", "--teacher", "teacher.pt")
+    code, _, error = here(base, "distill", "task.yaml", *resume, "3", "--teacher", "teacher.pt")
     assert code == 2 and "--teacher teacher.pt: this run began with sub/moved.pt; begin another one" in error
 
 
-def test_a_disk_that_fills_up_names_the_command_that_goes_on(base, here, monkeypatch):
-    """With the folder of the run, not that of a resolution."""
-    written = []
+def test_a_full_disk_prints_the_command_to_resume(base, here, monkeypatch):
+    """It names the folder of the run, not of a resolution."""
+    files = []
 
     def filled(state, file):
-        written.append(file)
-        if len(written) == 2:
+        files.append(file)
+        if len(files) == 2:
             raise FileError(file, "No space left on device")
 
     monkeypatch.setattr("tgdsl.rl.train.run.write_checkpoint", filled)
-    few = (*TEACHER, "--types", "none", "--seeds", "1", "--envs", "2", "--episodes", "0", *SMALL)
-    code, _, error = here(base, "distill", "task.yaml", *few, "--iterations", "1", "-o", "run")
-    whole = "run/default/checkpoint.pt is whole, of iteration 0; to go on: tgdsl distill task.yaml --device cpu --resume run"
-    assert (code, error.splitlines()[-1]) == (2, f"tgdsl: run/default/checkpoint.pt: No space left on device; {whole}")
+    arguments = (*TEACHER, "--types", "none", "--seeds", "1", "--envs", "2", "--episodes", "0", *SMALL)
+    code, _, error = here(base, "distill", "task.yaml", *arguments, "--iterations", "1", "-o", "run")
+    message = "run/default/checkpoint.pt is whole, of iteration 0; to go on: tgdsl distill task.yaml --device cpu --resume run"
+    assert (code, error.splitlines()[-1]) == (2, f"tgdsl: run/default/checkpoint.pt: No space left on device; {message}")
 
 
-def test_minutes_limit_each_start_and_are_told_of_all(base, here, monkeypatch):
-    """Of learning that takes 90 s by its own account. Names are written as people read them."""
-    asked = []
+def test_minutes_limit_each_start_and_are_summed(base, here, monkeypatch):
+    """Fake learning takes 90 s per start; names with umlauts stay readable."""
+    calls = []
 
     def learned(run, iterations, seconds, shown):
-        asked.append((iterations, run.seconds, seconds))
+        calls.append((iterations, run.seconds, seconds))
         run.seconds += 90.0
         run.save()
 
     monkeypatch.setattr(Run, "learn", learned)
     (base / "teacher.pt").rename(base / "Lehrer für alle.pt")
-    few = ("--teacher", "Lehrer für alle.pt", "--types", "none", "--seeds", "1", "--envs", "2", *SMALL, "-o", "run")
-    assert here(base, "distill", "task.yaml", *few, "--device", "cpu", "--episodes", "0", "--minutes", "2")[0] == 0
+    arguments = ("--teacher", "Lehrer für alle.pt", "--types", "none", "--seeds", "1", "--envs", "2", *SMALL, "-o", "run")
+    assert here(base, "distill", "task.yaml", *arguments, "--device", "cpu", "--episodes", "0", "--minutes", "2")[0] == 0
     assert '"Lehrer für alle.pt"' in (base / "run" / "distill.json").read_text()
-    on = ("--resume", "run", "--device", "cpu", "--episodes", "2", "--minutes", "3", "--iterations", "7")
-    code, _, error = here(base, "distill", "task.yaml", *on)
+    resume = ("--resume", "run", "--device", "cpu", "--episodes", "2", "--minutes", "3", "--iterations", "7")
+    code, _, error = here(base, "distill", "task.yaml", *resume)
     assert code == 0, error
-    assert asked == [(6000, 0.0, 120.0), (7, 90.0, 180.0)]
+    assert calls == [(6000, 0.0, 120.0), (7, 90.0, 180.0)]
     (row,) = rows_of(base / "run" / "table.csv")
     assert float(row["minutes"]) == 3.0
 
 
-def test_what_of_the_task_is_otherwise_than_for_the_teacher_is_told_once(base, here):
-    """What students feel is no change."""
-    few = (*TEACHER, "--types", "none", "--seeds", "1", "--envs", "2", "--episodes", "0", "--iterations", "1", *SMALL)
+def test_changes_since_the_teacher_are_printed_once(base, here):
+    """Sensing of students is no change."""
+    arguments = (*TEACHER, "--types", "none", "--seeds", "1", "--envs", "2", "--episodes", "0", "--iterations", "1", *SMALL)
     other = ("--set", "rewards.spin=3", "--set", "placement=all", "--resolutions", "low,high")
-    code, out, error = here(base, "distill", "task.yaml", *few, *other)
+    code, out, error = here(base, "distill", "task.yaml", *arguments, *other)
     assert code == 0, error
-    told = [line for line in out.splitlines() if "changed" in line]
-    assert told == ["changed since the teacher was learned: rewards.spin: 2.0, now 3.0"]
+    changes = [line for line in out.splitlines() if "changed" in line]
+    assert changes == ["changed since the teacher was learned: rewards.spin: 2.0, now 3.0"]
 
 
-def test_what_is_refused_leaves_a_run_as_it_was(base, here):
-    """An override that does not fit is not kept; a folder that holds a run takes no other; one killed early begins again."""
-    few = (*TEACHER, "--types", "none", "--seeds", "1", "--envs", "2", "--episodes", "2", *SMALL)
-    code, _, error = here(base, "distill", "task.yaml", *few, "--set", "distill.decoders={size: {}}", "-o", "run")
+def test_refused_arguments_leave_a_run_unchanged(base, here):
+    """Wrong overrides are not kept; a folder holds one run; a run killed early starts again."""
+    arguments = (*TEACHER, "--types", "none", "--seeds", "1", "--envs", "2", "--episodes", "2", *SMALL)
+    code, _, error = here(base, "distill", "task.yaml", *arguments, "--set", "distill.decoders={size: {}}", "-o", "run")
     assert code == 2 and 'no privileged number "size"' in error and not (base / "run").exists()
-    code, _, error = here(base, "distill", "task.yaml", *few, "--iterations", "1", "-o", "run")
+    code, _, error = here(base, "distill", "task.yaml", *arguments, "--iterations", "1", "-o", "run")
     assert code == 0, error
-    kept = {file: file.read_bytes() for file in (base / "run").rglob("*") if file.is_file()}
-    on = ("--resume", "run", "--device", "cpu", "--episodes", "0", "--iterations", "2")
-    code, _, error = here(base, "distill", "task.yaml", *on, "--set", "distill.networks.hidden=[9]")
+    contents = {file: file.read_bytes() for file in (base / "run").rglob("*") if file.is_file()}
+    resume = ("--resume", "run", "--device", "cpu", "--episodes", "0", "--iterations", "2")
+    code, _, error = here(base, "distill", "task.yaml", *resume, "--set", "distill.networks.hidden=[9]")
     assert code == 2 and "its networks are of other sizes" in error
     for more in ((), ("--resolutions", "low")):
-        code, _, error = here(base, "distill", "task.yaml", *few, *more, "-o", "run")
+        code, _, error = here(base, "distill", "task.yaml", *arguments, *more, "-o", "run")
         assert code == 2 and "run: this folder holds a run; go on with --resume run, or give another --out" in error
-    assert kept == {file: file.read_bytes() for file in (base / "run").rglob("*") if file.is_file()}
-    code, _, error = here(base, "distill", "task.yaml", *on, "--set", "distill.learning_rate=1e-5")
+    assert contents == {file: file.read_bytes() for file in (base / "run").rglob("*") if file.is_file()}
+    code, _, error = here(base, "distill", "task.yaml", *resume, "--set", "distill.learning_rate=1e-5")
     assert code == 0, error
     assert json.loads((base / "run" / "distill.json").read_text())["overrides"]["distill.learning_rate"] == "1e-5"
     (base / "run" / "default" / "checkpoint.pt").unlink()
-    kept = {file: file.read_bytes() for file in (base / "run").rglob("*") if file.is_file()}
-    code, _, error = here(base, "distill", "task.yaml", *on)
+    contents = {file: file.read_bytes() for file in (base / "run").rglob("*") if file.is_file()}
+    code, _, error = here(base, "distill", "task.yaml", *resume)
     assert code == 2 and "run/default: there is no checkpoint.pt to go on with" in error
-    assert kept == {file: file.read_bytes() for file in (base / "run").rglob("*") if file.is_file()}
-    (base / "run" / "default" / "curve.csv").unlink()  # as of one that was killed before its first checkpoint
-    code, _, error = here(base, "distill", "task.yaml", *on)
+    assert contents == {file: file.read_bytes() for file in (base / "run").rglob("*") if file.is_file()}
+    (base / "run" / "default" / "curve.csv").unlink()  # like a run killed before its first checkpoint
+    code, _, error = here(base, "distill", "task.yaml", *resume)
     assert code == 0, error
     assert [row["iteration"] for row in rows_of(base / "run" / "default" / "curve.csv")] == ["1", "2"]
     (base / "other").mkdir()
     (base / "other" / "default").write_text("")
-    code, _, error = here(base, "distill", "task.yaml", *few, "--iterations", "1", "-o", "other")
+    code, _, error = here(base, "distill", "task.yaml", *arguments, "--iterations", "1", "-o", "other")
     assert code == 2 and "other/default is a file, expected a folder" in error
     assert [file.name for file in (base / "other").iterdir()] == ["default"]
     (base / "run" / "distill.json").unlink()
-    code, _, error = here(base, "distill", "task.yaml", *few, "-o", "run")
+    code, _, error = here(base, "distill", "task.yaml", *arguments, "-o", "run")
     assert code == 2 and "run: this folder holds default/run.json of a run; give another --out" in error
 
 
-def test_resolutions_are_simulations_one_after_the_other(base, here, monkeypatch):
-    """One that the layout lacks is named before the first begins, and one that cannot go on before the first goes on."""
+def test_resolutions_are_simulated_one_after_another(base, here, monkeypatch):
+    """Unknown resolutions, and ones that cannot resume, are named before any starts."""
     compared = []
     monkeypatch.setattr("tgdsl.commands.distill._warn_unlike", compared.extend)
     arguments = (*TEACHER, "--types", "depth", "--placements", "ends", "--seeds", "2", "--envs", "4", "--iterations", "1")
@@ -271,14 +271,14 @@ def test_resolutions_are_simulations_one_after_the_other(base, here, monkeypatch
     assert [card["groups"]["tactile_sensors"] for card in cards] == [4, 9]
     file = base / "both" / "high" / "checkpoint.pt"
     file.write_bytes(file.read_bytes()[:-1])
-    kept = {file: file.read_bytes() for file in (base / "both").rglob("*") if file.is_file()}
+    contents = {file: file.read_bytes() for file in (base / "both").rglob("*") if file.is_file()}
     code, out, error = here(base, "distill", "task.yaml", "--resume", "both", "--device", "cpu", "--iterations", "2")
-    assert (code, out) == (2, "") and f"both/high/checkpoint.pt: found {len(kept[file]):,} bytes that are cut off" in error
-    assert kept == {file: file.read_bytes() for file in (base / "both").rglob("*") if file.is_file()}
+    assert (code, out) == (2, "") and f"both/high/checkpoint.pt: found {len(contents[file]):,} bytes that are cut off" in error
+    assert contents == {file: file.read_bytes() for file in (base / "both").rglob("*") if file.is_file()}
 
 
-def test_unlike_numbers_of_control_steps_are_warned_of():
-    """Beyond a tenth."""
+def test_differing_numbers_of_control_steps_warn():
+    """If they differ by more than a tenth."""
     rows = [
         Row("depth", "tips", name, "clean", 3, 0.5, 0.4, 0.6, 1.0, 9, samples, 1.0)
         for name, samples in (("low", 1100), ("med", 1000))
@@ -295,14 +295,14 @@ def test_mistakes_are_named_before_anything_runs(base, fails):
     assert "types bool, bool: one is named twice" in fails(*TEACHER, "--types", "bool,bool")
     assert "--resolutions low,low: one is named twice" in fails(*TEACHER, "--resolutions", "low,low")
     assert "--resolutions: expected one at least" in fails(*TEACHER, "--resolutions", ",")
-    alike = fails(*TEACHER, "--types", "depth", "--placements", "fing*,fing_", "--seeds", "1")
-    assert "two students would have the name depth-fing_-clean-s0" in alike
+    message = fails(*TEACHER, "--types", "depth", "--placements", "fing*,fing_", "--seeds", "1")
+    assert "two students would have the name depth-fing_-clean-s0" in message
     assert "--teacher FILE is missing" in fails("--device", "cpu")
     assert "groups names a group twice" in fails(*TEACHER, "--set", "distill.groups=[proprio, proprio]")
-    felt = ("--types", "none,depth", "--placements", "all", "--set", "distill.groups=[tactile_sensors/depth/all/clean]")
-    assert 'there is no group of observations "tactile_sensors/depth/all/clean"' in fails(*TEACHER, *felt)
-    both = (*TEACHER, "--resolutions", "low", "--set", "resolution=high")
-    assert "--set resolution=high: --resolutions says it of students" in fails(*both)
+    arguments = ("--types", "none,depth", "--placements", "all", "--set", "distill.groups=[tactile_sensors/depth/all/clean]")
+    assert 'there is no group of observations "tactile_sensors/depth/all/clean"' in fails(*TEACHER, *arguments)
+    resolution_twice = (*TEACHER, "--resolutions", "low", "--set", "resolution=high")
+    assert "--set resolution=high: --resolutions says it of students" in fails(*resolution_twice)
     assert "--set touch=depth: --types says it of students" in fails(*TEACHER, "--set", "touch=depth")
     assert "--seeds 0: expected at least 1" in fails(*TEACHER, "--seeds", "0")
     assert "there is no run of tgdsl distill to go on with" in fails("--resume", "nothing")
@@ -317,7 +317,7 @@ def test_mistakes_are_named_before_anything_runs(base, fails):
         ({"physics": {"timestep": 0.005, "substeps": 4}}, "learned with other control steps [s]: 0.02, here 0.025"),
     ],
 )
-def test_a_teacher_of_something_else_is_refused(base, fails, change, message):
+def test_a_teacher_of_another_task_is_refused(base, fails, change, message):
     task = load_task(base / "task.yaml")
     spec = task.spec.model_dump(mode="json") | change
     teacher(base / "teacher.pt", task, ["priv_proprio"], spec=spec)
@@ -330,7 +330,7 @@ def test_a_teacher_of_other_taxels_or_without_a_card_is_refused(base, fails):
     extra = {"card.json": "", "taxels.csv": ""}
     module = torch.jit.load(base / "teacher.pt", _extra_files=extra)
     lines = extra["taxels.csv"].decode().splitlines(keepends=True)
-    extra["taxels.csv"] = "".join([lines[0], *lines[2:], lines[1]])  # the first taxel comes last
+    extra["taxels.csv"] = "".join([lines[0], *lines[2:], lines[1]])  # move the first taxel to the end
     torch.jit.save(module, base / "teacher.pt", _extra_files=extra)
     assert "teacher.pt: this policy feels with other taxels" in fails(*TEACHER, *FIVE, "--envs", "10")
     stacked = task.spec.model_dump(mode="json") | {"temporal": "stack"}
@@ -343,14 +343,14 @@ def test_a_teacher_of_other_taxels_or_without_a_card_is_refused(base, fails):
     assert "its card has no deviations of actions, `std`" in fails(*TEACHER, *FIVE, "--envs", "10", *divided)
 
 
-def test_students_of_a_sweep_go_on(base, here, monkeypatch):
-    """A trial whose worker died after it had begun, with a checkpoint, goes on in its folder."""
-    few = (*TEACHER, "--types", "none", "--seeds", "1", "--envs", "2", "--episodes", "2", *SMALL)
-    assert here(base, "distill", "task.yaml", *few, "--iterations", "1", "-o", "x")[0] == 0
+def test_students_of_a_sweep_are_resumed(base, here, monkeypatch):
+    """A trial whose worker died after a checkpoint resumes in its folder."""
+    arguments = (*TEACHER, "--types", "none", "--seeds", "1", "--envs", "2", "--episodes", "2", *SMALL)
+    assert here(base, "distill", "task.yaml", *arguments, "--iterations", "1", "-o", "x")[0] == 0
     (base / "x" / "table.csv").unlink()
     for name in ("argv", "stdout", "stderr"):
         monkeypatch.setattr(sys, name, getattr(sys, name))
-    trial = Trial("x", {}, ("distill", "task.yaml", *few, "--iterations", "3"))
+    trial = Trial("x", {}, ("distill", "task.yaml", *arguments, "--iterations", "3"))
     assert run_trial(trial, str(base / "x")) == "done", (base / "x" / "log.txt").read_text()
     with (base / "x" / "default" / "curve.csv").open(newline="") as file:
         assert [row["iteration"] for row in csv.DictReader(file)] == ["1", "2", "3"]

@@ -1,4 +1,4 @@
-"""`tgdsl examples`: what is copied is complete by itself, and nothing of the user's is overwritten."""
+"""`tgdsl examples`: copies are complete, and the user's files are not overwritten."""
 
 import filecmp
 from pathlib import Path
@@ -11,7 +11,7 @@ from tgdsl.rl.load import load_task
 
 REPOSITORY = Path(__file__).parents[2]
 SCENES = {"pyramid": 0, "plugins/plugins": 1, "tasks/find_ridge": 1, "tasks/published/screwdriver": 1}
-"""Examples, and how many robots belong to them."""
+"""Examples and their numbers of robots."""
 
 
 def copies(folder: Path) -> dict[str, Path]:
@@ -43,7 +43,7 @@ def test_a_task_is_copied_with_its_class_and_its_policy(tmp_path, here):
     }
 
 
-def test_without_a_name_all_are_copied(tmp_path, here):
+def test_without_a_name_all_examples_are_copied(tmp_path, here):
     assert here(tmp_path, "examples", "copy")[0] == 0
     files = copies(tmp_path)
     assert {f"examples/{name}{file.suffix}" for name, file in example_names().items()} <= files.keys()
@@ -52,16 +52,16 @@ def test_without_a_name_all_are_copied(tmp_path, here):
 
 def test_changed_files_are_not_overwritten(tmp_path, here):
     assert here(tmp_path, "examples", "copy", "pyramid")[0] == 0
-    before = (tmp_path / "examples" / "pyramid.xml").stat().st_mtime_ns
+    modified_at = (tmp_path / "examples" / "pyramid.xml").stat().st_mtime_ns
     assert here(tmp_path, "examples", "copy", "pyramid")[0] == 0
-    assert (tmp_path / "examples" / "pyramid.xml").stat().st_mtime_ns == before  # the same content is not written again
+    assert (tmp_path / "examples" / "pyramid.xml").stat().st_mtime_ns == modified_at  # equal content is not rewritten
     (tmp_path / "examples" / "pyramid.yaml").write_text("mine")
     code, _, error = here(tmp_path, "examples", "copy", "pyramid", "xhand1_palm")
     assert code == 2 and error.startswith("tgdsl: already there, with other content: examples/pyramid.yaml; ")
     assert (tmp_path / "examples" / "pyramid.yaml").read_text() == "mine" and not (tmp_path / "robots").exists()
 
 
-def test_an_unknown_name(tmp_path, here):
+def test_an_unknown_example_is_refused(tmp_path, here):
     code, _, error = here(tmp_path, "examples", "copy", "xhand1_pam")
     assert code == 2 and error == 'tgdsl: there is no example "xhand1_pam"; did you mean "xhand1_palm"?\n'
     assert not list(tmp_path.iterdir())

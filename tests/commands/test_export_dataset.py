@@ -1,4 +1,4 @@
-"""`tgdsl export-dataset`: what it refuses before anything is written."""
+"""`tgdsl export-dataset`: arguments that it refuses before it writes anything."""
 
 import numpy as np
 import pytest

@@ -15,7 +15,7 @@ from tgdsl.schema.load import load_layout
 
 REPOSITORY = Path(__file__).parents[2]
 EXAMPLES = [REPOSITORY / "examples" / f"{name}.yaml" for name in ("pyramid", "xhand1_palm")]
-"""Examples of the two layouts."""
+"""Examples with the two layouts."""
 ARRAYS = ("link_id", "pos", "normal", "tangent", "radius", "area", "cell")
 HAND = """
 <mujoco>
@@ -61,13 +61,13 @@ def test_taxels_of_examples_keep_their_bits(example, tmp_path):
 def test_odd_names_grids_samples_and_points_keep_their_bits(tmp_path, here):
     (tmp_path / "hand.xml").write_text(HAND)
     (tmp_path / "layout.yaml").write_text(LAYOUT)
-    code, said, error = here(tmp_path, "layout", "freeze", "hand.xml", "-o", "new/my frozen.yaml")
+    code, output, error = here(tmp_path, "layout", "freeze", "hand.xml", "-o", "new/my frozen.yaml")
     assert code == 0, error
     files = ["my frozen.low_1.csv", "my frozen.low_1_2.csv", "my frozen.yaml"]
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == files
-    assert said.splitlines()[:2] == ["low/1: 26 taxels", said.splitlines()[1]]
-    documents = [{"tgdsl": 1, "robot": {"model": str(tmp_path / "hand.xml"), "layout": str(tmp_path / own)}}
-                 for own in ("layout.yaml", "new/my frozen.yaml")]  # fmt: skip
+    assert output.splitlines()[:2] == ["low/1: 26 taxels", output.splitlines()[1]]
+    documents = [{"tgdsl": 1, "robot": {"model": str(tmp_path / "hand.xml"), "layout": str(tmp_path / layout_name)}}
+                 for layout_name in ("layout.yaml", "new/my frozen.yaml")]  # fmt: skip
     first, second = (placed(document).layouts for document in documents)
     assert list(first) == list(second) == ["low/1", "low.1"]
     for name in first:
@@ -79,7 +79,7 @@ def test_odd_names_grids_samples_and_points_keep_their_bits(tmp_path, here):
 
 @pytest.mark.filterwarnings("ignore::tgdsl.errors.UnfeltWarning")
 def test_a_module_reads_the_same_to_the_last_bit(tmp_path, here):
-    """Of samples and a grid with images: every array of the plan, and readings of random states."""
+    """Every array of the plan and readings of random states, for samples and a grid."""
     (tmp_path / "hand.xml").write_text(HAND)
     (tmp_path / "layout.yaml").write_text(LAYOUT)
     assert here(tmp_path, "layout", "freeze", "hand.xml", "--resolutions", "low/1")[0] == 0
@@ -90,8 +90,8 @@ def test_a_module_reads_the_same_to_the_last_bit(tmp_path, here):
         "resolution": "low/1",
         "sensors": {"touch": {"kind": "kinematic_taxel", "links": "all, of it", "feels": ["cube"]}},
     }
-    modules = [tgdsl.compile(document, overrides={"robot.layout": str(tmp_path / own)})
-               for own in ("layout.yaml", "layout_frozen.yaml")]  # fmt: skip
+    modules = [tgdsl.compile(document, overrides={"robot.layout": str(tmp_path / layout_name)})
+               for layout_name in ("layout.yaml", "layout_frozen.yaml")]  # fmt: skip
     one, other = (module.plan.arrays for module in modules)
     assert one.keys() == other.keys()
     assert all(one[name].tobytes() == other[name].tobytes() for name in one)
@@ -117,7 +117,7 @@ def test_nothing_is_replaced_unless_forced(tmp_path, here):
     assert "layout_frozen.yaml: this file is there already" in error
 
 
-def test_mistakes_of_the_command(tmp_path, here):
+def test_wrong_arguments_are_refused(tmp_path, here):
     (tmp_path / "hand.xml").write_text(HAND)
     (tmp_path / "layout.yaml").write_text(LAYOUT)
     code, _, error = here(tmp_path, "layout", "freeze", "hand.xml", "--resolutions", "low")
@@ -132,7 +132,7 @@ def test_mistakes_of_the_command(tmp_path, here):
     assert 'layout.yaml:7:5: resolutions.low/1.pat: no body, geom or mesh matches "pat"; did you mean "pad"?' in error
 
 
-def test_a_document_without_a_layout_has_nothing_to_write_down(tmp_path, here):
+def test_a_document_without_a_layout_is_refused(tmp_path, here):
     (tmp_path / "hand.xml").write_text(HAND)
     (tmp_path / "doc.yaml").write_text("""
 tgdsl: 1

@@ -1,4 +1,4 @@
-"""`tgdsl grasps`: what it says, where grasps go, and what it refuses."""
+"""`tgdsl grasps`: output, files and errors."""
 
 import numpy as np
 import pytest
@@ -11,12 +11,12 @@ from tgdsl.rl.grasps import sampling as loading
 
 @pytest.fixture
 def document(tmp_path, monkeypatch):
-    """A task, and a cache of its own."""
+    """Return a task with a fresh cache."""
     monkeypatch.setenv("TGDSL_CACHE", str(tmp_path / "cache"))
     return write_pincer(tmp_path / "task")
 
 
-def test_the_task_finds_what_was_sampled(here, document, monkeypatch):
+def test_the_task_uses_the_sampled_grasps(here, document, monkeypatch):
     code, out, err = here(document.parent, "grasps", "task.yaml")
     assert (code, err) == (0, "")
     assert out == f"6 grasps of 2 variants of rod: {cache.folder()}\n"
@@ -25,15 +25,15 @@ def test_the_task_finds_what_was_sampled(here, document, monkeypatch):
     assert len(TouchEnv(document, 2, threads=1).task.grasps.qpos) == 6
 
 
-def test_num_and_seed_and_a_file(here, document):
+def test_num_seed_and_a_file_can_be_given(here, document):
     code, out, _ = here(document.parent, "grasps", "task.yaml", "--num", "4", "--seed", "3", "--out", "kept/my grasps.npz")
     assert code == 0 and out.splitlines()[0].startswith("4 grasps of 2 variants of rod") and len(out.splitlines()) == 2
     assert out.splitlines()[1] == "file: kept/my grasps.npz"
     env = TouchEnv(document, 2, threads=1, overrides={"grasps.file": "kept/my grasps.npz"})
     assert len(env.task.grasps.qpos) == 4
-    with np.load(document.parent / "kept" / "my grasps.npz") as found:
-        assert found["variant"].tolist() == [0, 0, 1, 1]
-    # A document that names a file is sampled again all the same.
+    with np.load(document.parent / "kept" / "my grasps.npz") as grasps:
+        assert grasps["variant"].tolist() == [0, 0, 1, 1]
+    # A document that names a file is still sampled.
     code, out, _ = here(document.parent, "grasps", "task.yaml", "--num", "2", "--set", "grasps.file=nowhere.npz")
     assert code == 0 and out.splitlines()[0].startswith("2 grasps")
     assert "--set, has the same" in out.splitlines()[1]
@@ -50,12 +50,12 @@ def test_num_and_seed_and_a_file(here, document):
         (("sensors.yaml",), "this is a document of sensors"),
     ],
 )
-def test_mistakes_are_told_without_a_traceback(here, document, arguments, says):
+def test_mistakes_are_reported_without_a_traceback(here, document, arguments, says):
     code, out, err = here(document.parent, "grasps", *arguments)
     assert code == 2 and out == "" and says in err and "Traceback" not in err
 
 
-def test_a_task_without_grasps_is_told(here, document):
+def test_a_task_without_grasps_is_refused(here, document):
     document.write_text(
         document.read_text().replace("task: screwdriver", "task: in_palm_rotate").replace("grasps:", "# grasps:")
     )

@@ -1,4 +1,4 @@
-"""The help of every command: an example that the command takes, and defaults that say something."""
+"""The help of every command: a valid example and readable defaults."""
 
 import shlex
 import sys
@@ -16,7 +16,7 @@ from tgdsl_docs.commands import command_names, help_of
 
 NAMES = [" ".join(words) for words in command_names(Command)]
 GROUPS = {"examples", "layout", "hand", "calibrate"}
-"""Commands that only have commands of their own."""
+"""Commands that only have subcommands."""
 
 
 def test_every_command_has_an_example():
@@ -24,13 +24,13 @@ def test_every_command_has_an_example():
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_the_example_of_a_command_is_taken(name):
+def test_the_example_of_a_command_is_valid(name):
     action = tyro.cli(Command, prog="tgdsl", args=[*name.split(), *shlex.split(EXAMPLES[name])])
     assert callable(action.run)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_defaults_say_something(name):
+def test_defaults_are_readable(name):
     text = help_of(tuple(name.split()))
     assert text.startswith(f"usage: tgdsl {name}") and "None" not in text and "default: ()" not in text
 

@@ -1,4 +1,4 @@
-"""`tgdsl listen`: files of a short run, and what is refused."""
+"""`tgdsl listen`: files of a short run, and errors."""
 
 import sys
 
@@ -36,7 +36,7 @@ def document(tmp_path):
 @pytest.mark.slow
 def test_a_run_is_written_as_files_and_a_picture(document, tmp_path, capsys):
     Listen(document, seconds=0.08, out=tmp_path / "out").run()
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "ear.wav",
         "knock.wav",
@@ -46,11 +46,11 @@ def test_a_run_is_written_as_files_and_a_picture(document, tmp_path, capsys):
     for name in ("knock", "motors", "ear"):
         samples, rate = soundfile.read(tmp_path / "out" / f"{name}.wav")
         assert rate == 20000 and len(samples) == 1600 and np.abs(samples).max() == pytest.approx(0.7, abs=1e-3)
-        assert f"{name}: {tmp_path / 'out' / name}.wav, 20000 Hz, full scale is " in said
-    assert "spectrogram: " in said
+        assert f"{name}: {tmp_path / 'out' / name}.wav, 20000 Hz, full scale is " in output
+    assert "spectrogram: " in output
 
 
-def test_chosen_sensors_alone(document, tmp_path):
+def test_only_selected_sensors_are_written(document, tmp_path):
     Listen(document, ("ear",), seconds=0.01, out=tmp_path / "out").run()
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["ear.wav", "spectrogram.png"]
 
@@ -66,13 +66,13 @@ def test_chosen_sensors_alone(document, tmp_path):
         ),
     ],
 )
-def test_what_makes_no_sound_is_refused(document, tmp_path, sensors, overrides, message):
+def test_sensors_without_sound_are_refused(document, tmp_path, sensors, overrides, message):
     with pytest.raises(TgdslError, match=message):
         Listen(document, sensors, out=tmp_path / "out", set=overrides).run()
     assert not (tmp_path / "out").exists()
 
 
-def test_without_soundfile_it_says_what_to_install(document, monkeypatch):
+def test_without_soundfile_the_error_names_what_to_install(document, monkeypatch):
     monkeypatch.setitem(sys.modules, "soundfile", None)
     with pytest.raises(TgdslError, match=r'pip install "tgdsl\[sound\]"'):
         Listen(document).run()

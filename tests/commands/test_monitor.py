@@ -9,9 +9,9 @@ from tgdsl.runtime.xhand1.wire.protocol import Command
 
 def test_monitor_shows_the_last_state_on_a_pipe(emulator, plugged, here, tmp_path):
     plugged(emulator.device)
-    code, said, error = here(tmp_path, "hand", "monitor", "--seconds", "0.3", "--hand-id", "0")
+    code, output, error = here(tmp_path, "hand", "monitor", "--seconds", "0.3", "--hand-id", "0")
     assert (code, error) == (0, "")
-    lines = said.splitlines()
+    lines = output.splitlines()
     assert lines[0] == f"{emulator.device}: hand 0"
     assert lines[1].split()[:3:2] == ["reading", "age"]
     assert lines[3].split() == ["fingertip", "x", "y", "z", "|force|", "counts", "°C"]
@@ -21,26 +21,26 @@ def test_monitor_shows_the_last_state_on_a_pipe(emulator, plugged, here, tmp_pat
     assert len(lines) == 23
 
 
-def test_monitor_in_newton_and_what_cannot_be(emulator, plugged, here, tmp_path):
+def test_monitor_shows_newtons_with_a_calibration(emulator, plugged, here, tmp_path):
     newton = Calibration("N", np.full((5, 3), 0.1), np.tile(np.eye(3), (5, 1, 1)), np.zeros((5, 3)), TARE)
     (tmp_path / "hand.yaml").write_text(newton.text())
     arguments = ("hand", "monitor", "--port", emulator.device, "--hand-id", "0", "--seconds", "0.2", "--calibration")
-    code, said, _ = here(tmp_path, *arguments, "hand.yaml")
+    code, output, _ = here(tmp_path, *arguments, "hand.yaml")
     assert code == 0
-    assert said.splitlines()[3].split()[-2:] == ["N", "°C"]
-    assert said.splitlines()[4].split()[:5] == ["thumb", "0.00", "0.00", "0.00", "0.00"]
+    assert output.splitlines()[3].split()[-2:] == ["N", "°C"]
+    assert output.splitlines()[4].split()[:5] == ["thumb", "0.00", "0.00", "0.00", "0.00"]
     code, _, error = here(tmp_path, *arguments, "none.yaml")
     assert (code, error) == (2, "none.yaml: cannot read this file: No such file or directory\n1 mistake\n")
     assert sum(frame.command == Command.EXCHANGE for _, frame in emulator.requests) < 200
 
 
 def test_commands_on_an_emulated_hand_by_name(here, tmp_path):
-    code, said, error = here(tmp_path, "hand", "monitor", "--port", "emulator", "--seconds", "0.3", "--hand-id", "0")
+    code, output, error = here(tmp_path, "hand", "monitor", "--port", "emulator", "--seconds", "0.3", "--hand-id", "0")
     assert (code, error) == (0, "")
-    assert said.splitlines()[4].split()[:5] == ["thumb", "0.00", "0.00", "0.00", "0.00"]
-    code, said, error = here(tmp_path, "hand", "probe", "--port", "emulator", "--hand-id", "0")
+    assert output.splitlines()[4].split()[:5] == ["thumb", "0.00", "0.00", "0.00", "0.00"]
+    code, output, error = here(tmp_path, "hand", "probe", "--port", "emulator", "--hand-id", "0")
     assert (code, error) == (0, "")
-    assert "emulated" in said
+    assert "emulated" in output
     code, _, error = here(tmp_path, "hand", "tare", "--port", "emulator", "--hand-id", "0", "-o", "tare.yaml")
     assert (code, error) == (0, "")
     assert not load_calibration(tmp_path / "tare.yaml").tare.any()

@@ -1,4 +1,4 @@
-"""A task of one's own whose files stand in folders of their own, from wherever it is learned."""
+"""A custom task with files in separate folders, learned from any folder."""
 
 import json
 
@@ -25,7 +25,7 @@ class Own(InPalmRotate):
 
 @pytest.fixture
 def base(tmp_path):
-    """Files in `code`, `robots`, `sensors` and `tasks/mine`, and two folders to work in."""
+    """Return a folder with files in `code`, `robots`, `sensors` and `tasks/mine`, and two working folders."""
     for name in ("code", "robots", "sensors", "tasks/mine", "here", "there/below"):
         (tmp_path / name).mkdir(parents=True)
     (tmp_path / "code" / "own.py").write_text(CODE)
@@ -66,7 +66,7 @@ class Own(Task[TaskSpec]):
 """
 
 
-def test_of_an_object_that_cannot_move_no_gait_is_printed(base, here):
+def test_no_gait_is_printed_for_an_immovable_object(base, here):
     scene = base / "robots" / "scene.xml"
     fixed = scene.read_text().replace('<freejoint name="item"/>', "").replace(' 0 0 .0205 1 0 0 0"', '"')
     scene.write_text(fixed)
@@ -78,8 +78,8 @@ def test_of_an_object_that_cannot_move_no_gait_is_printed(base, here):
     assert out.startswith("score 0.000") and len(out.splitlines()) == 1
 
 
-def test_it_is_learned_and_goes_on_from_anywhere(base, here):
-    """Its document may also stand elsewhere, as long as it names the same files."""
+def test_a_custom_task_is_learned_and_resumed_from_any_folder(base, here):
+    """Its document may also move, as long as it names the same files."""
     task, moved, run = "../tasks/mine/task.yaml", "../../tasks/moved.yaml", "../../here/out/task"
     for folder, *words in (
         ("here", "train", task, *ON, "1", "--episodes", "4", *ARGUMENTS),
@@ -93,8 +93,8 @@ def test_it_is_learned_and_goes_on_from_anywhere(base, here):
     ):
         code, _, error = here(base / folder, *words, *(("--episodes", "0") if words[0] == "distill" else ()))
         assert code == 0, (words, error)
-    kept = base / "here" / "out" / "task"
-    assert (kept / "own.py").read_text() == CODE and (kept / "all.yaml").is_file()
+    run_folder = base / "here" / "out" / "task"
+    assert (run_folder / "own.py").read_text() == CODE and (run_folder / "all.yaml").is_file()
     starts = json.loads((base / "here" / "out" / "task_students" / "default" / "run.json").read_text())["starts"]
     assert [start["teacher"] for start in starts] == ["out/task/policy.pt", *[f"{run}/policy.pt"] * 2, "out/task/policy.pt"]
     assert len({start["teacher_sha256"] for start in starts}) == 1

@@ -1,4 +1,4 @@
-"""`tgdsl play`, as users run it: what it shows, what it writes, and what it says to mistakes."""
+"""`tgdsl play` as users run it: output, files and errors."""
 
 import mujoco
 import numpy as np
@@ -29,81 +29,81 @@ def without_opengl(monkeypatch):
 
 @pytest.fixture
 def fails(here, base):
-    """Run a command that a user got wrong; return what it says. Nothing is written."""
+    """Return a function that runs a wrong command and returns its message; it must write nothing."""
 
     def run(*arguments):
-        before = sorted(base.rglob("*"))
+        files_before = sorted(base.rglob("*"))
         code, out, message = here(base, "play", *arguments)
         assert (code, out) == (2, ""), message
-        assert sorted(base.rglob("*")) == before
+        assert sorted(base.rglob("*")) == files_before
         return message
 
     return run
 
 
-def test_play(base, here, without_opengl):
+def test_play_prints_means_and_writes_a_record(base, here, without_opengl):
     code, out, error = here(base, "play", "task.yaml", "--envs", "2", "--seconds", "0.3", "--actions", "random", "--out", "a b")
     assert code == 0, error
     lines = out.splitlines()
     assert lines[0] == "t = 0.30 s, 2 environments, 2 episodes ended"
     assert lines[1].split() == ["mean", "over", "environments", "so", "far", "ended"]
-    shown = {line.split()[0]: line.split()[-2:] for line in lines[3:-2]}
-    assert list(shown)[:4] == ["score", "return", "success", "spin"]
+    columns = {line.split()[0]: line.split()[-2:] for line in lines[3:-2]}
+    assert list(columns)[:4] == ["score", "return", "success", "spin"]
     assert lines[-2] == "record: a b/played.npz"
     assert lines[-1].startswith("no video: OpenGL cannot be started (FatalError: gladLoadGL error); without a display set ")
-    with np.load(base / "a b" / "played.npz") as found:
-        reward = found["reward"]
-        assert found["qpos"].shape == (12, 2, 9) and found["obs:tactile_sensors"].shape == (12, 2, 4)
-        assert found["action"].std() > 0.3
-    assert shown["return"] == [f"{reward[STEPS:].sum(0).mean():.3g}", f"{reward[:STEPS].sum(0).mean():.3g}"]
+    with np.load(base / "a b" / "played.npz") as record:
+        reward = record["reward"]
+        assert record["qpos"].shape == (12, 2, 9) and record["obs:tactile_sensors"].shape == (12, 2, 4)
+        assert record["action"].std() > 0.3
+    assert columns["return"] == [f"{reward[STEPS:].sum(0).mean():.3g}", f"{reward[:STEPS].sum(0).mean():.3g}"]
     assert [path.name for path in (base / "a b").iterdir()] == ["played.npz"]
 
 
-def test_the_video_shows_what_the_policy_feels(base, here, monkeypatch):
-    """What is drawn at each step is what was observed there; a policy without touch has nothing drawn."""
+def test_the_video_shows_the_touch_that_the_policy_observes(base, here, monkeypatch):
+    """Each frame draws the observation of its step; nothing is drawn for a policy without touch."""
     import tgdsl.rl.playing.video as module
 
     sensors = base / "sensors.yaml"
-    sensors.write_text(
-        sensors.read_text().replace("direction: [0, 0, -1]", "direction: [0, 0, 1]")
-    )  # the side that rests on the item
+    sensors.write_text(sensors.read_text().replace("direction: [0, 0, -1]", "direction: [0, 0, 1]"))  # the side on the item
     traces = []
     monkeypatch.setattr(module, "video", lambda *arguments: traces.append(arguments[-1]))
     for touch in ("bool", "none"):
         arguments = ("task.yaml", "--envs", "2", "--seconds", "0.3", "--actions", "random", "--set", f"touch={touch}")
         code, _, error = here(base, "play", *arguments, "--out", touch)
         assert code == 0, error
-    with np.load(base / "bool" / "played.npz") as found:
-        bits = found["obs:tactile_sensors"][:, 0]
+    with np.load(base / "bool" / "played.npz") as record:
+        bits = record["obs:tactile_sensors"][:, 0]
     assert bits.any() and not bits.all()
     np.testing.assert_array_equal(traces[0].values[1:], bits[1:])
     assert traces[1] is None
 
 
-def test_an_episode_of_zeros_is_the_default(base, here):
+def test_one_episode_of_zero_actions_is_the_default(base, here):
     code, out, error = here(base, "play", "task.yaml", "--no-video", "--set", "rewards.tilt=0", "--set", "touch=none")
     assert code == 0, error
     assert out.startswith("t = 0.20 s, 16 environments, 16 episodes ended\n")
     assert out.endswith("record: out/played.npz\n")
-    with np.load(base / "out" / "played.npz") as found:
-        assert not found["action"].any() and not found["term:tilt"].any()
-        assert "obs:tactile_sensors" not in found
+    with np.load(base / "out" / "played.npz") as record:
+        assert not record["action"].any() and not record["term:tilt"].any()
+        assert "obs:tactile_sensors" not in record
 
 
 def test_the_same_seed_gives_the_same_record(base, here):
     def played(seed):
         assert here(base, "play", "task.yaml", "--envs", "2", "--no-video", "--actions", "random", "--seed", seed)[0] == 0
-        with np.load(base / "out" / "played.npz") as found:
-            return dict(found)
+        with np.load(base / "out" / "played.npz") as record:
+            return dict(record)
 
-    once, again, other = played("3"), played("3"), played("4")
-    for name, value in once.items():
-        np.testing.assert_array_equal(again[name], value)
-    assert not np.array_equal(other["action"], once["action"]) and not np.array_equal(other["qpos"][0], once["qpos"][0])
+    first, repeated, other_seed = played("3"), played("3"), played("4")
+    for name, value in first.items():
+        np.testing.assert_array_equal(repeated[name], value)
+    assert not np.array_equal(other_seed["action"], first["action"]) and not np.array_equal(
+        other_seed["qpos"][0], first["qpos"][0]
+    )
 
 
-def test_a_policy(base, here):
-    """A linear one, of which the actions follow from the observations that are kept with them."""
+def test_actions_of_a_policy_follow_its_observations(base, here):
+    """The record holds the observations and actions of a linear policy."""
 
     class Linear(torch.nn.Module):
         def __init__(self):
@@ -118,22 +118,22 @@ def test_a_policy(base, here):
     arguments = ("task.yaml", "--policy", "policy.pt", "--groups", "goal", "proprio", "--envs", "2", "--no-video")
     code, _, error = here(base, "play", *arguments)
     assert code == 0, error
-    with np.load(base / "out" / "played.npz") as found:
-        obs = np.concatenate([found["obs:goal"], found["obs:proprio"]], axis=2)
+    with np.load(base / "out" / "played.npz") as record:
+        obs = np.concatenate([record["obs:goal"], record["obs:proprio"]], axis=2)
         expected = policy(torch.from_numpy(obs)).detach()
-        np.testing.assert_allclose(found["action"], expected, atol=1e-6)
+        np.testing.assert_allclose(record["action"], expected, atol=1e-6)
 
 
-def test_a_script(base, here):
+def test_actions_can_come_from_a_function(base, here):
     (base / "act.py").write_text("def up(env, obs):\n    return 0.1 * env.steps[:, None].expand(-1, env.num_actions)\n")
     code, _, error = here(base, "play", "task.yaml", "--actions", "act.py:up", "--envs", "2", "--no-video")
     assert code == 0, error
-    with np.load(base / "out" / "played.npz") as found:
-        np.testing.assert_allclose(found["action"][:, 1, 1], 0.1 * np.arange(STEPS))
+    with np.load(base / "out" / "played.npz") as record:
+        np.testing.assert_allclose(record["action"][:, 1, 1], 0.1 * np.arange(STEPS))
 
 
 @pytest.mark.slow
-def test_mistakes(base, fails):
+def test_wrong_arguments_are_refused(base, fails):
     (base / "wrong.yaml").write_text(TASK.replace("in_palm_rotate", "in_palm_rotat").replace('"*"', '"*", "nose"'))
     (base / "act.py").write_text("def up(env, obs):\n    return obs['gaol']\n")
     (base / "text.pt").write_text("no module")
@@ -187,7 +187,7 @@ def test_mistakes(base, fails):
 
 
 @pytest.mark.parametrize("where", ["stepping", "writing"])
-def test_ctrl_c_leaves_nothing_half_written(base, here, monkeypatch, where):
+def test_ctrl_c_leaves_no_partial_files(base, here, monkeypatch, where):
     (base / "out").mkdir()
     (base / "out" / "played.npz").write_bytes(b"before")
 
@@ -200,8 +200,8 @@ def test_ctrl_c_leaves_nothing_half_written(base, here, monkeypatch, where):
         monkeypatch.setattr(PlayRecord, "add", interrupted)
     else:
         monkeypatch.setattr(np, "savez_compressed", interrupted)
-    before = sorted(base.rglob("*"))
+    files_before = sorted(base.rglob("*"))
     code, _, error = here(base, "play", "task.yaml", "--no-video")
     assert (code, error.splitlines()[-1]) == (130, "interrupted")
-    assert sorted(base.rglob("*")) == before
+    assert sorted(base.rglob("*")) == files_before
     assert (base / "out" / "played.npz").read_bytes() == b"before"

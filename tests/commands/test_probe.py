@@ -1,4 +1,4 @@
-"""`tgdsl hand probe`, and which hand a command finds, against emulated hands."""
+"""`tgdsl hand probe`, and how commands find a hand, with emulated hands."""
 
 import os
 
@@ -11,21 +11,21 @@ from tgdsl.runtime.xhand1.wire.protocol import Command
 
 
 def pseudo_terminal() -> tuple[int, int, str]:
-    """Return a serial port on which nobody answers."""
+    """Return both ends and the name of a serial port without a device."""
     ends = os.openpty()
     return *ends, os.ttyname(ends[1])
 
 
-def test_probe(emulator, plugged, here, tmp_path):
-    one, other, silent = pseudo_terminal()
+def test_probe_describes_each_port(emulator, plugged, here, tmp_path):
+    first_end, second_end, silent = pseudo_terminal()
     try:
         plugged(emulator.device, silent, "/dev/none")
-        code, said, error = here(tmp_path, "hand", "probe")
+        code, output, error = here(tmp_path, "hand", "probe")
     finally:
-        os.close(one)
-        os.close(other)
+        os.close(first_end)
+        os.close(second_end)
     assert (code, error) == (0, "")
-    lines = said.splitlines()
+    lines = output.splitlines()
     assert lines[0] == f"{emulator.device} (an adapter)"
     identity = 'version "tgdsl emulator", side 01, serial number "X1-0042", name ff 00'
     assert lines[1] == f"  {emulator.device}: hand 0, {identity}"
@@ -37,8 +37,8 @@ def test_probe(emulator, plugged, here, tmp_path):
 
 def test_probe_of_one_port(emulator, plugged, here, tmp_path):
     plugged("/dev/none")
-    code, said, _ = here(tmp_path, "hand", "probe", "--port", emulator.device)
-    assert (code, len(said.splitlines())) == (0, 2)
+    code, output, _ = here(tmp_path, "hand", "probe", "--port", emulator.device)
+    assert (code, len(output.splitlines())) == (0, 2)
     code, _, error = here(tmp_path, "hand", "probe", "--port", "/dev/none")
     assert code == 2
     assert error.startswith("tgdsl: /dev/none cannot be opened")
@@ -50,18 +50,18 @@ def test_a_computer_without_ports(plugged, here, tmp_path):
     assert here(tmp_path, "hand", "monitor") == (2, "", "tgdsl: no hand answers; this computer has no serial port\n")
 
 
-def test_no_hand_or_several_are_an_error_that_lists_them(emulator, plugged, here, tmp_path, monkeypatch):
+def test_no_hand_or_several_hands_are_errors_that_list_them(emulator, plugged, here, tmp_path, monkeypatch):
     with FaultyEmulator(first_order_hand(3)) as second:
         plugged(emulator.device, second.device)
         with monkeypatch.context() as patient:  # two emulators on a busy computer
             patient.setattr(ports, "_PATIENT", SerialTiming(reply_timeout_s=0.4))
             code, _, error = here(tmp_path, "hand", "monitor", "--seconds", "0.1")
         assert code == 2
-        found = f"{emulator.device} (id 0), {second.device} (id 3)"
-        assert error == f"tgdsl: 2 hands answer: {found}; choose one with --port or --hand-id\n"
-        code, said, error = here(tmp_path, "hand", "monitor", "--seconds", "0.1", "--hand-id", "3")
+        hands = f"{emulator.device} (id 0), {second.device} (id 3)"
+        assert error == f"tgdsl: 2 hands answer: {hands}; choose one with --port or --hand-id\n"
+        code, output, error = here(tmp_path, "hand", "monitor", "--seconds", "0.1", "--hand-id", "3")
         assert code == 0, error
-        assert said.startswith(f"{second.device}: hand 3\n")
+        assert output.startswith(f"{second.device}: hand 3\n")
         code, _, error = here(tmp_path, "hand", "monitor", "--hand-id", "5")
         assert (
             error

@@ -1,4 +1,4 @@
-"""`tgdsl sweep`: what is run, what a mistake is called, and what becomes of a run whose worker is killed."""
+"""`tgdsl sweep`: trials, error messages, and runs whose worker is killed."""
 
 import json
 import re
@@ -60,18 +60,27 @@ def test_every_combination_is_a_trial(base):
     assert trials[4].settings == {"action.scale": "10 deg", "--seed": 2}
 
 
-def test_students_are_trials_too(base):
+def test_students_can_be_trials(base):
     """A teacher's path is relative to the sweep's document."""
     (base / "teachers").mkdir()
     (base / "teachers" / "t.pt").write_bytes(b"")
     fixed = {"--teacher": "teachers/t.pt", "--types": "bool,none", "--seeds": 1, "--resolutions": "low,high"}
     document = write(base, {"--iterations": [1, 2]}, fixed, command="distill")
     _, trials = load_sweep(document)
-    who = ("--teacher", str(base / "teachers" / "t.pt"), "--types", "bool,none", "--seeds", "1", "--resolutions", "low,high")
-    assert trials[1].words == ("distill", str(base / "task.yaml"), *who, "--iterations", "2")
+    teacher_options = (
+        "--teacher",
+        str(base / "teachers" / "t.pt"),
+        "--types",
+        "bool,none",
+        "--seeds",
+        "1",
+        "--resolutions",
+        "low,high",
+    )
+    assert trials[1].words == ("distill", str(base / "task.yaml"), *teacher_options, "--iterations", "2")
 
 
-def test_the_example():
+def test_the_example_has_nine_trials():
     spec, trials = load_sweep(EXAMPLE)
     assert len(trials) == 9 and (spec.cpus, spec.gpus) == (4, 1)
 
@@ -151,16 +160,16 @@ def test_the_example():
     ],
 )
 def test_mistakes_are_named_before_anything_runs(base, changes, place, what):
-    with pytest.raises(SpecError, match=what) as found:
+    with pytest.raises(SpecError, match=what) as error:
         load_sweep(write(base, **changes))
-    assert place in str(found.value)
+    assert place in str(error.value)
 
 
 @pytest.mark.parametrize("place", [".", "low"])
-def test_a_run_that_goes_on_learns_the_minutes_that_are_left(tmp_path, place):
-    """9 of 30 seconds were learned when its checkpoint was written: 0.35 minutes are left; and none where more was.
+def test_a_resumed_run_learns_for_the_remaining_minutes(tmp_path, place):
+    """The checkpoint was written after 9 of 30 seconds: 0.35 minutes remain, and none after 42 seconds.
 
-    Iterations that it made later, of which it was writing the last one, are made again.
+    Iterations after the checkpoint, even a partly written one, do not count.
     """
     words = ["train", "task.yaml", "--minutes", "0.5", "--seed", "1"]
     assert left(words, tmp_path) == words
@@ -169,11 +178,11 @@ def test_a_run_that_goes_on_learns_the_minutes_that_are_left(tmp_path, place):
     for seconds, expected in ((9.0, 0.35), (42.0, 0.0)):
         state = {"format": FORMAT, "seconds": seconds}
         torch.save(state, tmp_path / place / "checkpoint.pt")
-        found = left(words, tmp_path)
-        assert found[:3] + found[4:] == words[:3] + words[4:] and float(found[3]) == pytest.approx(expected)
+        remaining = left(words, tmp_path)
+        assert remaining[:3] + remaining[4:] == words[:3] + words[4:] and float(remaining[3]) == pytest.approx(expected)
 
 
-def test_a_trial_that_is_wrong_says_so_and_one_that_was_made_is_left_alone(base, monkeypatch):
+def test_wrong_trials_report_it_and_finished_ones_are_left_alone(base, monkeypatch):
     for name in ("argv", "stdout", "stderr"):
         monkeypatch.setattr(sys, name, getattr(sys, name))
     trial = Trial("x", {"--seed": 1}, ("train", "nowhere.yaml", "--device", "cpu"))
@@ -183,8 +192,8 @@ def test_a_trial_that_is_wrong_says_so_and_one_that_was_made_is_left_alone(base,
     (base / "x" / "ended.json").write_text("{}")
     assert run_trial(trial, str(base / "x")) == "finished earlier"
     other = Trial("x", {"--seed": 1}, ("train", "nowhere.yaml", "--envs", "4"))
-    what = "its folder holds a run of other settings, `tgdsl train nowhere.yaml --device cpu`; give another --out"
-    assert run_trial(other, str(base / "x")) == f"failed: {what}"
+    message = "its folder holds a run of other settings, `tgdsl train nowhere.yaml --device cpu`; give another --out"
+    assert run_trial(other, str(base / "x")) == f"failed: {message}"
 
 
 def test_an_error_of_a_trial_is_in_its_log(base, monkeypatch):
@@ -192,8 +201,8 @@ def test_an_error_of_a_trial_is_in_its_log(base, monkeypatch):
         monkeypatch.setattr(sys, name, getattr(sys, name))
     (base / "z").mkdir()
     (base / "z" / "checkpoint.pt").write_text("")
-    wrong = run_trial(Trial("z", {}, ("train", "task.yaml", "--minutes", "1")), str(base / "z"))
-    assert wrong.startswith("failed: CheckpointError: ") and "checkpoint.pt: found 0 bytes that are cut off" in wrong
+    result = run_trial(Trial("z", {}, ("train", "task.yaml", "--minutes", "1")), str(base / "z"))
+    assert result.startswith("failed: CheckpointError: ") and "checkpoint.pt: found 0 bytes that are cut off" in result
     (base / "broken.py").write_text("raise ZeroDivisionError('of this test')")
     monkeypatch.setattr("runpy.run_module", lambda *_, **__: runpy.run_path(str(base / "broken.py")))
     assert run_trial(Trial("y", {}, ("train", "task.yaml")), str(base / "y")) == "failed: ZeroDivisionError: of this test"
@@ -201,37 +210,37 @@ def test_an_error_of_a_trial_is_in_its_log(base, monkeypatch):
     assert not (base / "y" / "ended.json").exists()
 
 
-def test_what_a_trial_scored_is_told(base, monkeypatch):
-    """With the interval of its mean, which one episode has none of."""
+def test_the_score_of_a_trial_is_reported(base, monkeypatch):
+    """With its confidence interval, unless there is only one episode."""
     monkeypatch.setattr(sys, "argv", sys.argv)
     for ends, expected in (([0.1234, 0.5], "[0.123, 0.5]"), ([None, None], "[–, –]")):
-        own = base / str(ends[0])
+        folder = base / str(ends[0])
         score = json.dumps({"score": 0.25, "score_interval": ends, "unit": "rad"})
         monkeypatch.setattr(
-            "runpy.run_module", lambda *_, own=own, score=score, **__: (own / "evaluation.json").write_text(score)
+            "runpy.run_module", lambda *_, folder=folder, score=score, **__: (folder / "evaluation.json").write_text(score)
         )
-        assert run_trial(Trial("x", {}, ("train", "task.yaml")), str(own)) == f"score 0.25 {expected} rad"
+        assert run_trial(Trial("x", {}, ("train", "task.yaml")), str(folder)) == f"score 0.25 {expected} rad"
 
 
 def fake_ray(monkeypatch, cpus, gpus):
-    """Put a Ray with one machine in place of the real one, whose tasks tell their names; return what is asked of it."""
-    asked = []
+    """Replace Ray by one with a single machine; return the list of its options."""
+    requests = []
     work = SimpleNamespace(remote=lambda trial, place: (trial.name, place))
     ray = ModuleType("ray")
     ray.init = ray.shutdown = lambda **_: None
     ray.nodes = lambda: [{"Resources": {"CPU": cpus, "GPU": gpus}}]
-    ray.remote = lambda **own: lambda _: asked.append(own) or work
+    ray.remote = lambda **options: lambda _: requests.append(options) or work
     ray.wait, ray.get = lambda waiting: (waiting[:1], waiting[1:]), lambda done: f"was {done[0]}"
     ray.exceptions = ModuleType("ray.exceptions")
     for name in ("LocalRayletDiedError", "NodeDiedError", "OutOfMemoryError", "RayError", "WorkerCrashedError"):
         setattr(ray.exceptions, name, type(name, (Exception,), {}))
     monkeypatch.setitem(sys.modules, "ray", ray)
     monkeypatch.setitem(sys.modules, "ray.exceptions", ray.exceptions)
-    return asked
+    return requests
 
 
 @pytest.mark.parametrize(("cpus", "gpus"), [(1.0, 2.0), (4.0, 0.0)])
-def test_a_run_that_no_machine_can_hold_is_refused(base, here, monkeypatch, cpus, gpus):
+def test_a_run_too_large_for_every_machine_is_refused(base, here, monkeypatch, cpus, gpus):
     fake_ray(monkeypatch, cpus, gpus)
     write(base, {"--seed": [1]}, cpus=2, gpus=1)
     code, out, error = here(base, "sweep", "sweep.yaml")
@@ -239,23 +248,23 @@ def test_a_run_that_no_machine_can_hold_is_refused(base, here, monkeypatch, cpus
     assert (code, out) == (2, "") and expected in error
 
 
-def test_each_run_has_a_process_of_its_own(base, here, monkeypatch):
-    asked = fake_ray(monkeypatch, 2.0, 0.0)
+def test_each_run_gets_a_new_process(base, here, monkeypatch):
+    requests = fake_ray(monkeypatch, 2.0, 0.0)
     write(base, {"--seed": [1, 2]}, cpus=2, retries=1)
     code, out, error = here(base, "sweep", "sweep.yaml")
     assert (code, error) == (0, "")
-    assert asked == [{"num_cpus": 2, "num_gpus": 0, "max_retries": 1, "max_calls": 1}]
+    assert requests == [{"num_cpus": 2, "num_gpus": 0, "max_retries": 1, "max_calls": 1}]
     first = f"2 runs; log.txt in each folder of {(base / 'out/sweep').resolve()} has a run's progress"
     assert out.splitlines() == [first, "1/2 seed=1: was seed=1", "2/2 seed=2: was seed=2"]
 
 
-def test_a_name_may_be_as_long_as_a_folders(base):
+def test_names_of_trials_may_have_200_characters(base):
     _, (trial,) = load_sweep(write(base, {"--types": ["b" * 194]}, {"--teacher": "task.yaml"}, command="distill"))
     assert len(trial.name) == 200
 
 
 def killed_once(folder):
-    """Have the task kill the worker that comes to it first once there is a checkpoint."""
+    """Make the task kill the first worker that reaches it after a checkpoint."""
     (folder / "killed.py").write_text(KILLED)
     (folder / "kill").write_text("")
     task = (folder / "task.yaml").read_text().replace("task: in_palm_rotate", "task: killed.py:Killed")
@@ -263,15 +272,15 @@ def killed_once(folder):
 
 
 @pytest.mark.slow
-def test_two_workers_one_of_them_killed(base, here):
-    """Both runs end whole: the one that was killed went on from its checkpoint, and its curve has each iteration once."""
+def test_a_run_whose_worker_is_killed_resumes(base, here):
+    """Both runs finish: the killed one resumes from its checkpoint, and its curve has each iteration once."""
     killed_once(base)
     write(base, {"--seed": [1, 2]}, {**FIXED, "train.checkpoint": 1e-9})
     (base / "elsewhere").mkdir()
     code, out, error = here(base / "elsewhere", "sweep", "../sweep.yaml", "--out", "../runs")
     assert code == 0, error
     assert not (base / "kill").exists()
-    ended = re.findall(r"^([12])/2 .*quarter turns", out, re.MULTILINE)  # other lines are Ray's, about the worker that died
+    ended = re.findall(r"^([12])/2 .*quarter turns", out, re.MULTILINE)  # Ray prints other lines about the dead worker
     assert ended == ["1", "2"]
     starts = []
     for seed in (1, 2):

@@ -34,13 +34,13 @@ def base(tmp_path):
 
 @pytest.fixture
 def fails(here, base):
-    """Run a command that a user got wrong; return what it says. Nothing is written."""
+    """Return a function that runs a wrong command and returns its message; it must write nothing."""
 
     def run(*arguments):
-        before = sorted(base.rglob("*"))
+        files_before = sorted(base.rglob("*"))
         code, out, message = here(base, *arguments)
         assert (code, out) == (2, ""), message
-        assert sorted(base.rglob("*")) == before
+        assert sorted(base.rglob("*")) == files_before
         return message
 
     return run
@@ -97,11 +97,11 @@ def test_from_nothing_to_a_policy_that_plays(base, here):
     )
     assert code == 0, error
     assert out.splitlines()[0] == "changed since the policy was learned: rewards.spin: 3.0, now 2.0"
-    with np.load(base / "out" / "played.npz") as found:
-        assert found["action"].shape == (4, 1, 2)
+    with np.load(base / "out" / "played.npz") as record:
+        assert record["action"].shape == (4, 1, 2)
 
 
-def test_a_run_goes_on_with_its_overrides_and_says_what_has_changed(base, here):
+def test_a_resumed_run_keeps_its_overrides_and_prints_changes(base, here):
     start = ["train", "task.yaml", "--device", "cpu", "--episodes", "0"]
     assert here(base, *start, "--envs", "3", "--seed", "7", "--iterations", "1", "-o", "a run", *ARGUMENTS)[0] == 0
     code, out, error = here(base, *start, "--iterations", "3", "--resume", "a run", "--set", "rewards.spin=3")
@@ -109,38 +109,38 @@ def test_a_run_goes_on_with_its_overrides_and_says_what_has_changed(base, here):
     assert out.splitlines()[0] == "changed since the run began: rewards.spin: 2.0, now 3.0"
     assert "after 3 iterations, 36 steps" in out
     starts = json.loads((base / "a run" / "run.json").read_text())["starts"]
-    assert [(each["seed"], each["envs"], len(each["overrides"])) for each in starts] == [(7, 3, 8), (7, 3, 9)]
+    assert [(entry["seed"], entry["envs"], len(entry["overrides"])) for entry in starts] == [(7, 3, 8), (7, 3, 9)]
     assert here(base, *start, "--iterations", "4", "--resume", "a run", "-o", "other", *ARGUMENTS)[0] == 0
     assert json.loads((base / "other" / "run.json").read_text())["starts"][0]["spec"]["rewards"]["spin"] == 2.0
     assert [read_checkpoint(base / name / "checkpoint.pt")["iteration"] for name in ("a run", "other")] == [3, 4]
-    from_where = [[each.get("goes_on_from") for each in starts], *_starts(base / "other", "goes_on_from")]
+    from_where = [[entry.get("goes_on_from") for entry in starts], *_starts(base / "other", "goes_on_from")]
     assert from_where == [[None, "a run"], "a run"]
 
 
 def _starts(folder, name):
-    return [each[name] for each in json.loads((folder / "run.json").read_text())["starts"]]
+    return [entry[name] for entry in json.loads((folder / "run.json").read_text())["starts"]]
 
 
-def test_another_seed_and_other_sensors_are_told_and_what_a_version_did_not_know_is_not(base, here):
+def test_changed_seeds_and_sensors_are_printed_but_not_new_keys(base, here):
     start = ["train", "task.yaml", "--device", "cpu", "--episodes", "0"]
     assert here(base, *start, "--envs", "3", "--iterations", "1", "-o", "a run", *ARGUMENTS)[0] == 0
-    told = json.loads((base / "a run" / "run.json").read_text())
-    del told["starts"][0]["spec"]["goal_tolerance"]
-    (base / "a run" / "run.json").write_text(json.dumps(told))
+    run_content = json.loads((base / "a run" / "run.json").read_text())
+    del run_content["starts"][0]["spec"]["goal_tolerance"]
+    (base / "a run" / "run.json").write_text(json.dumps(run_content))
     (base / "sensors.yaml").write_text((base / "sensors.yaml").read_text() + "# the same\n")
     code, out, error = here(base, *start, "--iterations", "2", "--resume", "a run", "--seed", "5")
     assert code == 0, error
     assert [line for line in out.splitlines() if "changed" in line] == ["changed since the run began: seed: 0, now 5"]
     code, out, error = here(base, *start, "--iterations", "3", "--resume", "a run", "--set", "touch=none")
     assert code == 0, error
-    begun = "changed since the run began: "
-    assert [line.removeprefix(begun) for line in out.splitlines() if begun in line] == [
+    prefix = "changed since the run began: "
+    assert [line.removeprefix(prefix) for line in out.splitlines() if prefix in line] == [
         'touch: "bool", now "none"',
         "the compiled module of the sensors' document",
     ]
 
 
-def test_two_documents_of_one_name_are_both_kept(base, here):
+def test_two_documents_with_one_name_are_both_kept(base, here):
     (base / "sub").mkdir()
     task = (base / "task.yaml").read_text().replace("document: sensors.yaml", "document: ../sensors.yaml")
     (base / "sub" / "sensors.yaml").write_text(task)
@@ -152,7 +152,7 @@ def test_two_documents_of_one_name_are_both_kept(base, here):
     assert (base / "run" / f"{base.name}_sensors.yaml").read_text() == (base / "sensors.yaml").read_text()
 
 
-def test_rates_that_are_set_when_a_run_goes_on_count(base, here):
+def test_rates_set_for_a_resumed_run_apply(base, here):
     start = ["train", "task.yaml", *ON, "--episodes", "0", *ARGUMENTS]
     assert here(base, *start, "--iterations", "1")[0] == 0
     set_ = ["--set", "train.adaptive=false", "--set", "train.learning_rate=5e-4", "--set", "train.networks.initial_std=0.5"]
@@ -163,8 +163,8 @@ def test_rates_that_are_set_when_a_run_goes_on_count(base, here):
     assert rows[2][rows[0].index("Loss/learning_rate")] == "0.0005"
 
 
-def test_time_is_a_limit_too(base, here):
-    """Without any no iteration is made, whether a run begins or goes on; else one at least."""
+def test_minutes_limit_learning(base, here):
+    """`--minutes 0` runs no iteration, also when a run resumes; more runs at least one."""
     start = ["train", "task.yaml", *ON, "--episodes", "0", *ARGUMENTS]
     for minutes, more, iterations in (
         ("0.0", (), 0),
@@ -177,21 +177,21 @@ def test_time_is_a_limit_too(base, here):
 
 
 @pytest.mark.parametrize("words", [("evaluate", "--episodes", "2"), ("play", "--seconds", "0.1", "--no-video")])
-def test_a_policy_is_read_once(base, here, monkeypatch, words):
-    """Before environments are made: what is written into its file meanwhile is another policy."""
+def test_a_policy_is_read_before_environments_are_made(base, here, monkeypatch, words):
+    """Later changes of its file have no effect."""
     assert here(base, "train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS)[0] == 0
-    file, made = base / "out" / "task" / "policy.pt", TouchEnv.__init__
+    file, original = base / "out" / "task" / "policy.pt", TouchEnv.__init__
 
     def replaced(self, *arguments, **options):
         file.write_bytes(b"another one, half written")
-        made(self, *arguments, **options)
+        original(self, *arguments, **options)
 
     monkeypatch.setattr(TouchEnv, "__init__", replaced)
     command, *options = words
     code, _, error = here(base, command, "task.yaml", "--policy", str(file), "--envs", "2", *options)
     assert code == 0, error
-    said = here(base, command, "task.yaml", "--policy", str(file), "--envs", "2", *options)[2]
-    assert said.startswith(f"tgdsl: {file}: this is no TorchScript file, as rsl_rl's `export_policy_to_jit` writes it")
+    message = here(base, command, "task.yaml", "--policy", str(file), "--envs", "2", *options)[2]
+    assert message.startswith(f"tgdsl: {file}: this is no TorchScript file, as rsl_rl's `export_policy_to_jit` writes it")
 
 
 def test_without_rsl_rl_the_error_names_what_to_install(fails, monkeypatch):
@@ -200,7 +200,7 @@ def test_without_rsl_rl_the_error_names_what_to_install(fails, monkeypatch):
     assert 'to learn needs rsl-rl-lib, and what that needs: pip install "tgdsl[rl]" (' in fails("train", "task.yaml", *ON)
 
 
-def test_an_evaluation_tells_which_variants_it_leaves_out(base, here):
+def test_an_evaluation_names_variants_that_it_leaves_out(base, here):
     sensors = base / "sensors.yaml"
     varied = "{body: item, variants: [{type: box, size: [2 cm, 2 cm, 2 cm]}, {type: sphere, size: [2 cm]}]}"
     sensors.write_text(sensors.read_text().replace("{body: item}", varied))
@@ -210,7 +210,7 @@ def test_an_evaluation_tells_which_variants_it_leaves_out(base, here):
         assert out.partition("score ")[0].splitlines() == says
 
 
-def test_mistakes(fails, here, base):
+def test_wrong_arguments_are_refused(fails, here, base):
     assert "there is no run to go on with: run.json is missing or empty" in fails("train", "task.yaml", *ON, "--resume", "none")
     assert "train.clip: -1 is out of range, expected more than 0" in fails("train", "task.yaml", *ON, "--set", "train.clip=-1")
     assert "--envs 0: expected at least 1" in fails("train", "task.yaml", "--device", "cpu", "--envs", "0")
@@ -219,14 +219,14 @@ def test_mistakes(fails, here, base):
     assert 'no group of observations "gaol"' in fails("train", "task.yaml", *ON, "--set", "train.actor=[gaol]")
     assert "none.pt: cannot read this file: No such file or directory" in fails("evaluate", "task.yaml", "--policy", "none.pt")
     if not torch.cuda.is_available():
-        assert 'there is no device "cuda": ' in (said := fails("train", "task.yaml")) and "--device cpu" in said
+        assert 'there is no device "cuda": ' in (message := fails("train", "task.yaml")) and "--device cpu" in message
     assert "--episodes 0: expected at least 1" in fails("evaluate", "task.yaml", "--episodes", "0")
     assert here(base, "train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS)[0] == 0
-    said = fails("train", "task.yaml", *ON)
-    assert said == "tgdsl: out/task: this folder holds a run; go on with --resume out/task, or give another --out\n"
+    message = fails("train", "task.yaml", *ON)
+    assert message == "tgdsl: out/task: this folder holds a run; go on with --resume out/task, or give another --out\n"
 
 
-def test_a_run_that_was_killed_before_its_first_checkpoint_begins_anew(base, here):
+def test_a_run_killed_before_its_first_checkpoint_starts_again(base, here):
     train = ("train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS)
     assert here(base, *train)[0] == 0
     folder = base / "out" / "task"
@@ -238,46 +238,46 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_begins_anew(base, her
     assert "this folder holds a run" in here(base, *train)[2]
 
 
-def test_a_checkpoint_that_is_cut_off_is_refused_and_nothing_is_lost(base, here, fails):
+def test_a_truncated_checkpoint_is_refused_and_all_files_stay(base, here, fails):
     assert here(base, "train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS)[0] == 0
     file = base / "out" / "task" / "checkpoint.pt"
     file.write_bytes(file.read_bytes()[:999])
-    kept = {each: each.read_bytes() for each in (base / "out").rglob("*") if each.is_file()}
+    contents = {path: path.read_bytes() for path in (base / "out").rglob("*") if path.is_file()}
     for out in ("out/task", "other"):
-        said = fails("train", "task.yaml", *ON, "--resume", "out/task", "--out", out)
-        assert said.startswith(
+        message = fails("train", "task.yaml", *ON, "--resume", "out/task", "--out", out)
+        assert message.startswith(
             "tgdsl: out/task/checkpoint.pt: found 999 bytes that are cut off, or of something else, expected"
         )
-    assert {each: each.read_bytes() for each in (base / "out").rglob("*") if each.is_file()} == kept
+    assert {path: path.read_bytes() for path in (base / "out").rglob("*") if path.is_file()} == contents
 
 
-def test_what_is_set_anew_replaces_what_stands_below_it(base, here):
-    """And speed is that of the iterations made since, in as many environments as there are now."""
+def test_a_repeated_override_replaces_keys_below_it(base, here):
+    """The speed is that of iterations since, with the current number of environments."""
     train = ("train", "task.yaml", "--device", "cpu", "--episodes", "0", *ARGUMENTS)
     first = ("--envs", "64", "--iterations", "1", "--set", "randomise={}", "--set", "randomise.friction=[0.5, 1.5]")
     assert here(base, *train, *first)[0] == 0
-    again = ("--envs", "2", "--iterations", "2", "--resume", "out/task", "--set", "randomise={}")
-    code, _, error = here(base, *train, *again)
+    resume = ("--envs", "2", "--iterations", "2", "--resume", "out/task", "--set", "randomise={}")
+    code, _, error = here(base, *train, *resume)
     assert code == 0, error
     starts = json.loads((base / "out" / "task" / "run.json").read_text())["starts"]
     assert [start["spec"]["randomise"]["friction"] for start in starts] == [[0.5, 1.5], [1.0, 1.0]]
     rows = (base / "out" / "task" / "curve.csv").read_text().splitlines()
     names = rows[0].split(",")
-    own = [dict(zip(names, row.split(","), strict=True)) for row in rows[1:]]
-    made = float(own[1]["samples"]) - float(own[0]["samples"])
-    assert made < 0.1 * float(own[0]["samples"])
-    assert float(own[1]["steps_per_second"]) <= 1.01 * made / (float(own[1]["rollout"]) + float(own[1]["update"]))
+    curve = [dict(zip(names, row.split(","), strict=True)) for row in rows[1:]]
+    new_steps = float(curve[1]["samples"]) - float(curve[0]["samples"])
+    assert new_steps < 0.1 * float(curve[0]["samples"])
+    assert float(curve[1]["steps_per_second"]) <= 1.01 * new_steps / (float(curve[1]["rollout"]) + float(curve[1]["update"]))
 
 
-def test_an_evaluation_is_written_into_a_folder_that_is_made(base, here, fails):
+def test_an_evaluation_is_written_into_a_new_folder(base, here, fails):
     code, _, error = here(base, "evaluate", "task.yaml", "--episodes", "2", "--envs", "2", "--out", "no/such/found.json")
     assert code == 0, error
     assert json.loads((base / "no" / "such" / "found.json").read_text())["episodes"] == 2
     assert "--groups belong to a policy" in fails("evaluate", "task.yaml", "--groups", "proprio")
 
 
-def test_an_evaluation_is_of_the_policy_beside_it(base, here, monkeypatch):
-    """Of a run that is interrupted while it evaluates there is none, and its policy has no score."""
+def test_an_interrupted_evaluation_leaves_no_old_score(base, here, monkeypatch):
+    """The evaluation file is gone, and the new policy has no score."""
     train = ("train", "task.yaml", "--device", "cpu", "--episodes", "2", *ARGUMENTS)
     assert here(base, *train, "--envs", "4", "--iterations", "1")[0] == 0
     folder = base / "out" / "task"
@@ -295,20 +295,22 @@ def test_an_evaluation_is_of_the_policy_beside_it(base, here, monkeypatch):
 @pytest.mark.parametrize(
     "command", [("train",), ("distill", "--teacher", "out/task/policy.pt", "--types", "none", "--envs", "3")]
 )
-def test_a_folder_in_which_another_process_runs_is_left_alone(base, here, fails, command):
-    """Before its checkpoint is read, which the other one may be about to replace; also one that holds no run yet."""
-    begun = ("train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS)
-    assert here(base, *begun)[0] == 0
+def test_a_folder_in_use_by_another_process_is_left_alone(base, here, fails, command):
+    """Its checkpoint is not read, as the other process may replace it; folders without a run count too."""
+    train = ("train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS)
+    assert here(base, *train)[0] == 0
     name, *options = command
     with RunFolder(base / "other" / "run").lock():
-        said = fails(name, "task.yaml", "--device", "cpu", *options, "--out", "other/run")
-        assert said == "tgdsl: other/run: another process runs in this folder; wait until it has ended, or give another --out\n"
+        message = fails(name, "task.yaml", "--device", "cpu", *options, "--out", "other/run")
+        assert (
+            message == "tgdsl: other/run: another process runs in this folder; wait until it has ended, or give another --out\n"
+        )
     (base / "out" / "task" / "checkpoint.pt").write_bytes(b"half written")
     with RunFolder(base / "out" / "task").lock():
         assert "another process runs in this folder" in fails("train", "task.yaml", *ON, "--resume", "out/task")
 
 
-def test_an_interrupted_run_leaves_its_policy_and_says_how_to_go_on(base, here, monkeypatch):
+def test_an_interrupted_run_leaves_its_policy_and_prints_how_to_resume(base, here, monkeypatch):
     iterate = Learner.iterate
 
     def interrupted(self, share=0.0):
@@ -329,17 +331,17 @@ def test_an_interrupted_run_leaves_its_policy_and_says_how_to_go_on(base, here, 
     assert "after 3 iterations" in out
 
 
-def test_a_policy_that_cannot_be_written_leaves_the_checkpoint_and_says_how_to_go_on(base, here, monkeypatch):
+def test_an_unwritable_policy_leaves_the_checkpoint_and_prints_how_to_resume(base, here, monkeypatch):
     def no_space(_policy, _card, file):
         raise FileError(file, "No space left on device")
 
     monkeypatch.setattr("tgdsl.rl.train.learner.write_policy", no_space)
     code, _, error = here(base, "train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS)
-    whole = "out/task/checkpoint.pt is whole, of iteration 1; to go on: tgdsl train task.yaml --device cpu --resume out/task"
-    assert (code, error.splitlines()[-1]) == (2, f"tgdsl: out/task/policy.pt: No space left on device; {whole}")
+    message = "out/task/checkpoint.pt is whole, of iteration 1; to go on: tgdsl train task.yaml --device cpu --resume out/task"
+    assert (code, error.splitlines()[-1]) == (2, f"tgdsl: out/task/policy.pt: No space left on device; {message}")
 
 
-def test_the_stage_of_a_learner_has_each_control_step_and_changes_nothing(tmp_path):
+def test_the_stage_of_a_learner_shows_each_control_step_without_effects(tmp_path):
     bare, _ = small_learner(tmp_path)
     viewed, _ = small_learner(tmp_path)
     stage, frames = LearnerStage(viewed.env), []
@@ -363,7 +365,7 @@ def test_the_stage_of_a_learner_has_each_control_step_and_changes_nothing(tmp_pa
 
 
 @pytest.mark.slow
-def test_a_viewed_learner_goes_on_when_the_page_is_opened_closed_and_lost(tmp_path, capsys):
+def test_a_viewed_learner_continues_when_the_page_opens_closes_or_dies(tmp_path, capsys):
     bare, _ = small_learner(tmp_path)
     viewed, _ = small_learner(tmp_path)
     torch.manual_seed(0)
@@ -372,11 +374,11 @@ def test_a_viewed_learner_goes_on_when_the_page_is_opened_closed_and_lost(tmp_pa
         viewed.iterate()
         for _ in range(2):
             with silent_browser(page.url):
-                begin, before = time.monotonic(), page.num_frames
-                while page.num_frames == before and time.monotonic() - begin < 60:
+                started, num_before = time.monotonic(), page.num_frames
+                while page.num_frames == num_before and time.monotonic() - started < 60:
                     viewed.iterate()
-                    time.sleep(0.2)  # the page's process, which has the lowest priority, starts meanwhile
-                assert page.num_frames > before
+                    time.sleep(0.2)  # give the page's low-priority process time to start
+                assert page.num_frames > num_before
         page._process.kill()
         viewed.iterate()
     torch.manual_seed(0)

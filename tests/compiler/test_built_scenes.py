@@ -1,4 +1,4 @@
-"""Scenes that someone else has built: the same readings as from their files."""
+"""Scenes passed in memory read the same as from their files."""
 
 import copy
 import re
@@ -54,7 +54,7 @@ def write(folder, scene=SCENE) -> str:
 
 
 def in_memory(folder, scene=SCENE) -> mujoco.MjSpec:
-    """Return the scene with its files in memory alone."""
+    """Return the scene with all its files in memory."""
     file = write(folder, scene)
     assets = {name: (folder / name).read_bytes() for name in ("tip.obj", "wood.png")}
     return mujoco.MjSpec.from_string(Path(file).read_text(), assets=assets)
@@ -67,7 +67,7 @@ def readings(touch) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.parametrize("built", ["spec", "model", "stage"])
-def test_readings_are_those_of_the_same_scene_from_its_file(tmp_path, built):
+def test_readings_equal_those_of_the_scene_from_its_file(tmp_path, built):
     scene = in_memory(tmp_path, SCENE if built == "spec" else SCENE.replace(FIELD, ""))  # USD has no height fields
     if built == "model":
         scene = scene.compile()
@@ -101,7 +101,7 @@ def test_the_artefact_simulates_without_the_files(tmp_path):
 
 
 def test_a_model_with_a_floor_needs_no_spec():
-    """The size of a plane is how much of it is drawn; it collides without end."""
+    """A plane's size only affects drawing; it collides without bounds."""
     text = """<mujoco><worldbody><geom type="plane" size="1 2 .1"/>
     <body name="pad" pos="0 0 .1"><geom type="box" size=".02 .02 .005"/></body>
     <body name="cube" pos="0 0 .2"><freejoint/><geom type="box" size=".02 .02 .02"/></body></worldbody></mujoco>"""
@@ -114,7 +114,7 @@ def test_a_model_with_a_floor_needs_no_spec():
     assert touch(sim.state())["load"].shape == (1, 1, 4)
 
 
-def test_models_that_a_document_names_must_be_those_in_the_scene(tmp_path):
+def test_models_in_a_document_must_match_the_scene(tmp_path):
     spec = mujoco.MjSpec.from_file(write(tmp_path))
     named = DOCUMENT | {"robot": {"model": str(tmp_path / "scene.xml"), "layout": LAYOUT}}
     assert tgdsl.compile(named, scene=spec).inputs == tgdsl.compile(named).inputs
@@ -134,7 +134,7 @@ def test_models_that_a_document_names_must_be_those_in_the_scene(tmp_path):
         tgdsl.compile(named, scene=other)
 
 
-def test_what_a_given_scene_cannot_do_is_said(tmp_path):
+def test_unsupported_uses_of_a_given_scene_are_refused(tmp_path):
     spec = in_memory(tmp_path)
     tuned = copy.deepcopy(DOCUMENT)
     tuned["sensors"]["skin"]["accuracy"] = "1 %"

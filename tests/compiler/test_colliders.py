@@ -1,4 +1,4 @@
-"""`robot: {collision: primitive}` in documents: scenes, artefacts, objects that vary, and mistakes at their places."""
+"""`robot: {collision: primitive}` in documents: scenes, artefacts, varying objects and located mistakes."""
 
 import mujoco
 import numpy as np
@@ -59,8 +59,8 @@ def document(folder, collision="primitive", placement=TAXELS, **ball):
 
 @pytest.mark.parametrize("surface", ["mesh", "collision"])
 def test_taxels_stay_and_contacts_count_for_the_same_link(folder, surface):
-    """A ball on the pad rests on the box, 2 mm higher above the pad than on the mesh, with its weight on the pad's only row."""
-    found = {}
+    """A ball rests on the box 2 mm higher than on the mesh, with its weight on the pad's only row."""
+    touch_and_height = {}
     for collision in ("mesh", "primitive"):
         touch = tgdsl.compile(document(folder, collision, TAXELS | {"surface": surface}), dtype=torch.float64)
         sim = tgdsl.simulate(touch, 1, substeps=10)
@@ -69,17 +69,17 @@ def test_taxels_stay_and_contacts_count_for_the_same_link(folder, surface):
         readings = touch(sim.state())
         weight = sim.model.body("ball").mass[0] * 9.81
         assert readings["f"][0, 0, :3].numpy() == pytest.approx([0, 0, -weight], abs=2e-3 * weight)
-        found[collision] = touch, sim.qpos[0, 3] - sim.qpos[0, 0]
-    assert found["mesh"][0].plan.taxels_id == found["primitive"][0].plan.taxels_id
-    assert float(found["primitive"][1] - found["mesh"][1]) == pytest.approx(0.002, abs=2e-5)
+        touch_and_height[collision] = touch, sim.qpos[0, 3] - sim.qpos[0, 0]
+    assert touch_and_height["mesh"][0].plan.taxels_id == touch_and_height["primitive"][0].plan.taxels_id
+    assert float(touch_and_height["primitive"][1] - touch_and_height["mesh"][1]) == pytest.approx(0.002, abs=2e-5)
 
 
 def test_an_artefact_keeps_the_colliders(folder):
     touch = tgdsl.compile(document(folder))
     tgdsl.save(touch, folder / "touch.safetensors")
-    again = tgdsl.load(folder / "touch.safetensors")
-    assert again.plan.scene == touch.plan.scene and len(touch.plan.scene.colliders) == 2
-    model = scene_model(again.plan.scene)
+    loaded = tgdsl.load(folder / "touch.safetensors")
+    assert loaded.plan.scene == touch.plan.scene and len(touch.plan.scene.colliders) == 2
+    model = scene_model(loaded.plan.scene)
     assert [model.geom(f"tgdsl/pad/collider/{i}").type[0] for i in range(2)] == [
         mujoco.mjtGeom.mjGEOM_BOX,
         mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -88,14 +88,14 @@ def test_an_artefact_keeps_the_colliders(folder):
     assert model.body("pad").mass[0] == 0.1
 
 
-def test_the_same_document_without_them_has_the_scene_that_it_had(folder):
+def test_a_document_without_colliders_has_an_unchanged_scene(folder):
     touch = tgdsl.compile(document(folder, "mesh"))
     assert touch.plan.scene.colliders == () and scene_model(touch.plan.scene).ngeom == 2
     assert scene_digest(touch.plan.scene) != scene_digest(tgdsl.compile(document(folder)).plan.scene)
 
 
-def test_objects_may_vary_beside_them(folder):
-    """Of two balls in two environments each rests with its own radius above the box."""
+def test_objects_may_vary_with_colliders(folder):
+    """In two environments, each ball rests at its own radius above the box."""
     variants = [{"type": "sphere", "size": [r], "density": 500} for r in (0.02, 0.03)]
     touch = tgdsl.compile(document(folder, variants=variants), dtype=torch.float64)
     sim = tgdsl.simulate(touch, 2, substeps=10)
@@ -119,13 +119,13 @@ def test_objects_may_vary_beside_them(folder):
         ("tgdsl: 1\nbodies: {}\n", "colliders.yaml:2"),
     ],
 )
-def test_mistakes_are_told_at_their_places(folder, text, says):
+def test_mistakes_in_colliders_are_located(folder, text, says):
     (folder / "colliders.yaml").unlink() if text is None else (folder / "colliders.yaml").write_text(text)
     with pytest.raises(SpecError) as error:
         tgdsl.compile(document(folder))
     assert says in str(error.value)
 
 
-def test_other_words_are_refused(folder):
+def test_unknown_kinds_of_collision_are_refused(folder):
     with pytest.raises(SpecError, match=r"robot\.collision"):
         tgdsl.compile(document(folder, "capsules"))

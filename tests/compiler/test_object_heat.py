@@ -1,4 +1,4 @@
-"""What the flow of heat needs to know of objects: their materials, and their geoms' volumes, areas and boxes."""
+"""Thermal properties of objects: materials, and volumes, areas and boxes of geoms."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ SCENE = """
 
 
 def heat_of(folder, body, **target) -> ObjectHeat | None:
-    """Return what is known of an object's heat."""
+    """Return an object's thermal properties."""
     angle = [trimesh.creation.box((0.02, 0.02, 0.02)).apply_translation(at) for at in ((0, 0, 0), (0.02, 0, 0), (0, 0.02, 0))]
     trimesh.util.concatenate(angle).export(folder / "bent.stl")
     (folder / "scene.xml").write_text(SCENE.format(folder / "bent.stl"))
@@ -44,64 +44,64 @@ def heat_of(folder, body, **target) -> ObjectHeat | None:
     return resolve(load(document)).objects["item"].heat
 
 
-def test_there_is_none_unless_asked_for(tmp_path):
+def test_objects_without_a_material_have_no_heat(tmp_path):
     assert heat_of(tmp_path, "ball") is None
 
 
 def test_a_ball(tmp_path):
-    found = heat_of(tmp_path, "ball", material="rubber", temperature="45 degC", cells=[2, 3, 4])
-    assert found is not None
-    assert (found.temperature, found.is_per_env, found.cells) == (45.0, False, (2, 3, 4))
-    assert found.materials == (MATERIALS["rubber"],)
-    np.testing.assert_allclose(found.volume, [4 / 3 * np.pi * 0.04**3], rtol=1e-14)
-    np.testing.assert_allclose(found.area, [4 * np.pi * 0.04**2], rtol=1e-14)
-    np.testing.assert_allclose(found.curvature, [25.0], rtol=1e-14)
-    np.testing.assert_allclose(found.box_center, np.zeros((1, 3)), atol=1e-16)
-    np.testing.assert_allclose(found.box_size, np.full((1, 3), 0.08), rtol=1e-14)
-    found = heat_of(tmp_path, "ball", material=["steel", {"like": "wood", "density": 700}], temperature={"per_env": "300 K"})
-    assert found is not None and found.is_per_env and found.temperature == pytest.approx(26.85) and found.cells is None
-    assert [material.density for material in found.materials] == [7854.0, 700.0]
-    found = heat_of(tmp_path, "ball", material="steel")
-    assert found is not None and found.temperature is None and not found.is_per_env
+    heat = heat_of(tmp_path, "ball", material="rubber", temperature="45 degC", cells=[2, 3, 4])
+    assert heat is not None
+    assert (heat.temperature, heat.is_per_env, heat.cells) == (45.0, False, (2, 3, 4))
+    assert heat.materials == (MATERIALS["rubber"],)
+    np.testing.assert_allclose(heat.volume, [4 / 3 * np.pi * 0.04**3], rtol=1e-14)
+    np.testing.assert_allclose(heat.area, [4 * np.pi * 0.04**2], rtol=1e-14)
+    np.testing.assert_allclose(heat.curvature, [25.0], rtol=1e-14)
+    np.testing.assert_allclose(heat.box_center, np.zeros((1, 3)), atol=1e-16)
+    np.testing.assert_allclose(heat.box_size, np.full((1, 3), 0.08), rtol=1e-14)
+    heat = heat_of(tmp_path, "ball", material=["steel", {"like": "wood", "density": 700}], temperature={"per_env": "300 K"})
+    assert heat is not None and heat.is_per_env and heat.temperature == pytest.approx(26.85) and heat.cells is None
+    assert [material.density for material in heat.materials] == [7854.0, 700.0]
+    heat = heat_of(tmp_path, "ball", material="steel")
+    assert heat is not None and heat.temperature is None and not heat.is_per_env
 
 
-def test_what_is_welded_to_a_body_is_part_of_it_in_its_frame(tmp_path):
-    """The handle is turned by 90° about x, so its y and z lengths change places; the lid has a joint."""
-    found = heat_of(tmp_path, "mug", material="glass")
-    assert found is not None
-    np.testing.assert_allclose(found.volume, [np.pi * 0.04**2 * 0.1 + 0.02 * 0.04 * 0.06], rtol=1e-12)
-    np.testing.assert_allclose(found.box_center, [[0.01, 0, 0]], atol=1e-12)
-    np.testing.assert_allclose(found.box_size, [[0.1, 0.08, 0.1]], rtol=1e-12)
+def test_welded_bodies_are_part_of_their_parent(tmp_path):
+    """The handle is rotated by 90° about x, which swaps y and z; the lid has a joint."""
+    heat = heat_of(tmp_path, "mug", material="glass")
+    assert heat is not None
+    np.testing.assert_allclose(heat.volume, [np.pi * 0.04**2 * 0.1 + 0.02 * 0.04 * 0.06], rtol=1e-12)
+    np.testing.assert_allclose(heat.box_center, [[0.01, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(heat.box_size, [[0.1, 0.08, 0.1]], rtol=1e-12)
 
 
 @pytest.mark.parametrize("surface", ["collision", "bent"])
-def test_a_mesh_holds_heat_where_it_is_not_in_its_hull(tmp_path, surface):
-    """Three cubes at an angle. MuJoCo turns a mesh into its principal axes: the box is that of the geom in its body all the same."""
-    found = heat_of(tmp_path, "bent", material="abs", surface=surface)
-    assert found is not None
-    np.testing.assert_allclose(found.volume, [3 * 0.02**3], rtol=1e-5)
-    np.testing.assert_allclose(found.box_center, [[0.01, 0.01, 0.5]], atol=1e-7)
-    np.testing.assert_allclose(found.box_size, [[0.04, 0.04, 0.02]], rtol=1e-5)
-    np.testing.assert_allclose(found.curvature, [0.0])
+def test_a_mesh_holds_heat_in_its_own_volume_not_its_hulls(tmp_path, surface):
+    """Three cubes in an L: MuJoCo rotates a mesh to its principal axes, but the box stays in the body's frame."""
+    heat = heat_of(tmp_path, "bent", material="abs", surface=surface)
+    assert heat is not None
+    np.testing.assert_allclose(heat.volume, [3 * 0.02**3], rtol=1e-5)
+    np.testing.assert_allclose(heat.box_center, [[0.01, 0.01, 0.5]], atol=1e-7)
+    np.testing.assert_allclose(heat.box_size, [[0.04, 0.04, 0.02]], rtol=1e-5)
+    np.testing.assert_allclose(heat.curvature, [0.0])
 
 
-def test_variants_have_their_own(tmp_path):
+def test_variants_have_separate_thermal_properties(tmp_path):
     variants = [
         {"type": "sphere", "size": ["2 cm"], "pos": [0, 0, 0.1]},
         {"geoms": [{"type": "box", "size": [0.01, 0.02, 0.03]}, {"type": "sphere", "size": [0.01], "pos": [0.2, 0, 0]}]},
     ]
-    found = heat_of(tmp_path, None, material="steel", variants=variants)
-    assert found is not None
-    np.testing.assert_allclose(found.volume, [4 / 3 * np.pi * 0.02**3, 48e-6 + 4 / 3 * np.pi * 0.01**3], rtol=1e-12)
+    heat = heat_of(tmp_path, None, material="steel", variants=variants)
+    assert heat is not None
+    np.testing.assert_allclose(heat.volume, [4 / 3 * np.pi * 0.02**3, 48e-6 + 4 / 3 * np.pi * 0.01**3], rtol=1e-12)
     areas = 8 * (0.0002 + 0.0006 + 0.0003), 4 * np.pi * 0.01**2
-    np.testing.assert_allclose(found.area, [4 * np.pi * 0.02**2, sum(areas)], rtol=1e-12)
-    np.testing.assert_allclose(found.curvature, [50.0, 100.0 * areas[1] / sum(areas)], rtol=1e-12)
-    np.testing.assert_allclose(found.box_center, [[0, 0, 0.1], [0.1, 0, 0]], atol=1e-12)
-    np.testing.assert_allclose(found.box_size, [[0.04] * 3, [0.22, 0.04, 0.06]], rtol=1e-12)
+    np.testing.assert_allclose(heat.area, [4 * np.pi * 0.02**2, sum(areas)], rtol=1e-12)
+    np.testing.assert_allclose(heat.curvature, [50.0, 100.0 * areas[1] / sum(areas)], rtol=1e-12)
+    np.testing.assert_allclose(heat.box_center, [[0, 0, 0.1], [0.1, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(heat.box_size, [[0.04] * 3, [0.22, 0.04, 0.06]], rtol=1e-12)
 
 
 def test_a_plane_is_a_half_space(tmp_path):
-    found = heat_of(tmp_path, "floor", material="wood")
-    assert found is not None
-    assert np.isinf(found.volume).all() and np.isinf(found.box_size).all()
-    assert (found.area == 0).all() and (found.curvature == 0).all() and (found.box_center == 0).all()
+    heat = heat_of(tmp_path, "floor", material="wood")
+    assert heat is not None
+    assert np.isinf(heat.volume).all() and np.isinf(heat.box_size).all()
+    assert (heat.area == 0).all() and (heat.curvature == 0).all() and (heat.box_center == 0).all()

@@ -1,4 +1,4 @@
-"""What a layout means on a robot: links, groups, geoms and meshes; and each mistake, told once and at its place."""
+"""Layouts resolved on a robot: links, groups, geoms and meshes; and one located message per mistake."""
 
 import json
 from pathlib import Path
@@ -22,21 +22,21 @@ def folder(tmp_path):
 
 
 def test_groups_patterns_and_body_order(folder):
-    found = resolved(folder)
-    assert [(link.name, link.body) for link in found.layout.links] == [
+    result = resolved(folder)
+    assert [(link.name, link.body) for link in result.layout.links] == [
         ("palm", "palm"),
         ("index_1", "index_1"),
         ("index_2", "index_2"),
         ("thumb_pad", "thumb_1"),
     ]
-    assert found.links == {"touch": ("palm", "index_1", "index_2", "thumb_pad")}
-    assert found.layout.groups == {
+    assert result.links == {"touch": ("palm", "index_1", "index_2", "thumb_pad")}
+    assert result.layout.groups == {
         "tips": ("index_2",),
         "index": ("index_1", "index_2"),
         "thumb": ("thumb_pad",),
         "all": ("palm", "index_1", "index_2", "thumb_pad"),
     }
-    np.testing.assert_array_equal(found.layout.link_id, [0, 1, 2, 3])
+    np.testing.assert_array_equal(result.layout.link_id, [0, 1, 2, 3])
 
 
 @pytest.mark.parametrize(
@@ -47,24 +47,24 @@ def test_groups_patterns_and_body_order(folder):
         (["index_?", "palm"], ("palm", "index_1", "index_2")),
         ({"include": ["*"], "exclude": ["tips"]}, ("palm", "index_1", "thumb_pad")),
         ({"include": ["all"], "exclude": ["thumb", "*_1"]}, ("palm", "index_2")),
-        ("thumb_1", ("thumb_pad",)),  # by the body that the geom belongs to
+        ("thumb_1", ("thumb_pad",)),  # by the body of the geom
         ("skin", ("index_2",)),  # by the mesh that is sampled
         ({"include": ["palm"], "exclude": ["nobody*"]}, ("palm",)),
     ],
 )
 def test_selections(folder, links, expected):
     text = DOCUMENT.replace("links: all", f"links: {json.dumps(links)}")
-    found = resolved(folder, text)
-    assert found.links == {"touch": expected}
-    assert {link.name for link in found.layout.links} == set(expected)
+    result = resolved(folder, text)
+    assert result.links == {"touch": expected}
+    assert {link.name for link in result.layout.links} == set(expected)
 
 
-def test_links_that_no_sensor_has_are_not_sampled(folder):
-    found = resolved(
+def test_links_without_sensors_are_not_sampled(folder):
+    result = resolved(
         folder, DOCUMENT.replace("links: all", "links: palm").replace("objects: {", "objects: {rest: {body: thumb_1}, ")
     )
-    assert found.layout.num_taxels == 1
-    assert found.unused == (
+    assert result.layout.num_taxels == 1
+    assert result.unused == (
         ("link index_1", "no sensor is on its taxels"),
         ("link index_2", "no sensor is on its taxels"),
         ("link thumb_pad", "no sensor is on its taxels"),
@@ -72,8 +72,8 @@ def test_links_that_no_sensor_has_are_not_sampled(folder):
     )
 
 
-def test_bodies_of_the_scene_that_nothing_feels_are_named_by_their_way(folder):
-    """Those of the robot are not listed, nor are those that an object is made of."""
+def test_unfelt_bodies_of_the_scene_are_named_by_their_path(folder):
+    """Bodies of the robot and of objects are not listed."""
     hand = HAND.replace('<body name="frame" pos="0 0 .1"/>', '<body pos="0 0 .1"><geom size=".001"/></body>')
     (folder / "hand.xml").write_text(hand)
     lid = '<body><geom size=".01"/></body>'
@@ -90,7 +90,7 @@ def test_bodies_of_the_scene_that_nothing_feels_are_named_by_their_way(folder):
     }
 
 
-def test_a_body_is_sampled_where_it_collides_a_geom_where_it_is(folder):
+def test_a_body_is_sampled_on_colliding_geoms_and_a_geom_on_itself(folder):
     grid = {"method": "grid", "rows": 1, "columns": 1, "direction": [-1, 0, 0], "radius": 0.001}
     body = with_layout(folder, {"index_1": grid}).layout
     np.testing.assert_allclose(body.pos, [[0.012, 0, 0]], atol=1e-9)
@@ -100,21 +100,24 @@ def test_a_body_is_sampled_where_it_collides_a_geom_where_it_is(folder):
 
 
 def test_keys_that_name_geoms_and_meshes(folder):
-    found = with_layout(folder, {"*_pad": POINT, "back": POINT})
-    assert [(link.name, link.body) for link in found.layout.links] == [
+    result = with_layout(folder, {"*_pad": POINT, "back": POINT})
+    assert [(link.name, link.body) for link in result.layout.links] == [
         ("back", "palm"),
         ("index_pad", "index_1"),
         ("thumb_pad", "thumb_1"),
     ]
-    found = with_layout(folder, {"skin": POINT}, ["*_2"])
-    assert [(link.name, link.body) for link in found.layout.links] == [("index_2/skin", "index_2"), ("thumb_2/skin", "thumb_2")]
-    found = with_layout(folder, {"pebble": POINT, "palm": POINT}, "skin")
-    assert [(link.name, link.body) for link in found.layout.links] == [("pebble", "rock")]
+    result = with_layout(folder, {"skin": POINT}, ["*_2"])
+    assert [(link.name, link.body) for link in result.layout.links] == [
+        ("index_2/skin", "index_2"),
+        ("thumb_2/skin", "thumb_2"),
+    ]
+    result = with_layout(folder, {"pebble": POINT, "palm": POINT}, "skin")
+    assert [(link.name, link.body) for link in result.layout.links] == [("pebble", "rock")]
 
 
 def test_a_pattern_for_several_bodies(folder):
-    found = with_layout(folder, {"*_2": POINT, "palm": POINT})
-    assert [link.name for link in found.layout.links] == ["palm", "index_2", "thumb_2"]
+    result = with_layout(folder, {"*_2": POINT, "palm": POINT})
+    assert [link.name for link in result.layout.links] == ["palm", "index_2", "thumb_2"]
 
 
 def test_two_layouts_for_one_link(folder):
@@ -126,29 +129,29 @@ def test_two_layouts_for_one_link(folder):
 
 
 def test_layout_keys_that_name_nothing(folder):
-    found = problems(folder, ("        index_1: ", "        index_3: "), ("        thumb_pad: ", "        frame: "))
-    assert found == [
+    messages = problems(folder, ("        index_1: ", "        index_3: "), ("        thumb_pad: ", "        frame: "))
+    assert messages == [
         'd.yaml:13:9: robot.layout.resolutions.low.index_3: no body, geom or mesh matches "index_3"; did you mean "index_2"?',
         'd.yaml:15:9: robot.layout.resolutions.low.frame: link "frame" has no geoms',
-    ] or pytest.fail("\n".join(found))
+    ] or pytest.fail("\n".join(messages))
 
 
 def test_a_group_that_contains_itself(folder):
-    """By way of another one, and in what that one leaves out."""
-    found = problems(folder, ('tips: ["*_2"]', 'tips: ["*_2", thumb]'))
-    assert [line.split(": ")[1] for line in found] == ["robot.layout.groups.tips[1]", "robot.layout.groups.thumb.exclude[0]"]
-    assert 'group "tips" contains itself' in found[0]
-    assert 'group "thumb" contains itself' in found[1]
+    """Through another group, and through what that group excludes."""
+    messages = problems(folder, ('tips: ["*_2"]', 'tips: ["*_2", thumb]'))
+    assert [line.split(": ")[1] for line in messages] == ["robot.layout.groups.tips[1]", "robot.layout.groups.thumb.exclude[0]"]
+    assert 'group "tips" contains itself' in messages[0]
+    assert 'group "thumb" contains itself' in messages[1]
 
 
-def test_a_group_right_inside_itself(folder):
-    found = problems(folder, ('tips: ["*_2"]', 'tips: ["*_2", tips]'))
-    assert len(found) == 1
-    assert 'group "tips" contains itself' in found[0]
+def test_a_group_that_directly_contains_itself(folder):
+    messages = problems(folder, ('tips: ["*_2"]', 'tips: ["*_2", tips]'))
+    assert len(messages) == 1
+    assert 'group "tips" contains itself' in messages[0]
 
 
-def test_a_group_of_the_link_that_it_is_called_after(folder):
-    """`palm: [palm]` is the link, wherever the group is named; and the same as without the group."""
+def test_a_group_may_have_the_name_of_its_link(folder):
+    """`palm: [palm]` selects the link, as without the group."""
     plain = resolved(folder)
     grouped = resolved(folder, DOCUMENT.replace('tips: ["*_2"]', 'palm: [palm]\n      tips: ["*_2"]'))
     assert dict(plain.links) == dict(grouped.links)
@@ -156,7 +159,7 @@ def test_a_group_of_the_link_that_it_is_called_after(folder):
 
 
 def test_a_layout_of_another_robot_is_one_mistake(folder):
-    """However many links, groups and sensors it has; one link that is there makes it this robot's."""
+    """However many links, groups and sensors it has; one link that exists makes it this robot's."""
     layout = {"groups": {"hand": ["a_*"], "tips": ["a_tip"]}, "resolutions": {"low": {"a_tip": POINT, "a_palm": POINT}}}
     touch = {"kind": "contact_depth", "feels": ["cube"]}
     document = {
@@ -177,14 +180,14 @@ def test_a_layout_of_another_robot_is_one_mistake(folder):
     assert len(caught.value.problems) == 6
 
 
-def test_a_group_that_matches_nothing_is_told_where_it_is_defined(folder):
+def test_a_group_that_matches_nothing_is_reported_at_its_definition(folder):
     assert problems(folder, ('tips: ["*_2"]', 'tips: ["*_2", "*_tipp"]')) == [
         'd.yaml:6:21: robot.layout.groups.tips[1]: no link matches "*_tipp"; did you mean "tips"?'
     ]
 
 
-def test_a_group_with_a_mistake_is_told_once(folder):
-    """Neither that it is missing, nor that it holds no link, where others name it."""
+def test_a_mistake_in_a_group_is_reported_once(folder):
+    """References to the group add no messages."""
     assert problems(folder, ('tips: ["*_2"]', 'tips: {includ: ["*_2"]}')) == [
         'd.yaml:6:7: robot.layout.groups.tips: missing key "include"',
         'd.yaml:6:14: robot.layout.groups.tips.includ: unknown key "includ"; did you mean "include"?',
@@ -205,8 +208,8 @@ def test_the_xhand1_at_every_resolution():
     }
     counts = {}
     for resolution in ("low", "med", "high"):
-        found = resolve(load({**document, "resolution": resolution}))
-        layout, robot = found.layout, found.robot
+        resolved_document = resolve(load({**document, "resolution": resolution}))
+        layout, robot = resolved_document.layout, resolved_document.robot
         counts[resolution] = layout.num_taxels
         np.testing.assert_allclose(np.linalg.norm(layout.normal, axis=1), 1, rtol=1e-9)
         for i, link in enumerate(layout.links):

@@ -1,4 +1,4 @@
-"""What sensors, objects and scenes mean on a robot; and each mistake, told once and at its place."""
+"""Sensors, objects and scenes resolved on a robot, and one located message per mistake."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_a_link_that_nobody_has(folder):
+def test_an_unknown_link_is_reported(folder):
     assert problems(folder, ("links: all", "links: [palm, indx_1]")) == [
         'd.yaml:21:46: sensors.touch.links[1]: no link matches "indx_1"; did you mean "index_1"?'
     ]
@@ -36,8 +36,8 @@ def test_exclude_leaves_no_link(folder):
     ]
 
 
-def pointed(text: str, line: str) -> tuple[str, str]:
-    """Return what stands in a document where a message points to, and the message."""
+def text_and_message(text: str, line: str) -> tuple[str, str]:
+    """Return the text of a document that a message points to, and the message."""
     _, row, column, message = line.split(":", 3)
     return text.splitlines()[int(row) - 1][int(column) - 1 :], message.strip()
 
@@ -65,14 +65,14 @@ def pointed(text: str, line: str) -> tuple[str, str]:
         ),
     ],
 )
-def test_a_plain_name_that_is_excluded_exists(folder, old, new, expected):
+def test_an_excluded_plain_name_must_exist(folder, old, new, expected):
     text = DOCUMENT.replace(old, new)
-    found = [pointed(text, line) for line in problems(folder, text=text)]
-    assert [message for _, message in found] == list(expected.values())
-    assert all(there.startswith(what) for (there, _), what in zip(found, expected, strict=True))
+    located = [text_and_message(text, line) for line in problems(folder, text=text)]
+    assert [message for _, message in located] == list(expected.values())
+    assert all(text_there.startswith(start) for (text_there, _), start in zip(located, expected, strict=True))
 
 
-def test_what_has_no_taxels_at_this_resolution_may_be_excluded(folder):
+def test_links_without_taxels_may_be_excluded(folder):
     assert resolved(folder, DOCUMENT.replace("resolution: low", "resolution: tip")).links == {"touch": ("index_2",)}
     text = DOCUMENT.replace("resolution: low", "resolution: tip").replace(
         "links: all", "links: {include: [all], exclude: [palm]}"
@@ -80,7 +80,7 @@ def test_what_has_no_taxels_at_this_resolution_may_be_excluded(folder):
     assert resolved(folder, text).links == {"touch": ("index_2",)}
 
 
-def test_a_geom_that_a_region_excludes_exists(folder):
+def test_a_geom_that_a_region_excludes_must_exist(folder):
     patch = "{method: poisson, count: 3, radius: 1 mm, region: REGION}"
     for region, where in (
         ("{geoms: {include: ['*'], exclude: [thumb_pda]}}", "geoms.exclude[0]"),
@@ -92,15 +92,15 @@ def test_a_geom_that_a_region_excludes_exists(folder):
         text = DOCUMENT.replace(f"palm: {PLACE}", f"palm: {patch.replace('REGION', region)}")
         (line,) = problems(folder, text=text)
         dotted = f"region{where}" if where.startswith("[") else f"region.{where}"
-        there, message = pointed(text, line)
-        what = 'no geom or mesh matches "thumb_pda"; did you mean "thumb_pad"?'
-        assert message == f"robot.layout.resolutions.low.palm.{dotted}: {what}"
-        assert there.startswith("thumb_pda")
-    fine = "{geoms: {include: ['*'], exclude: [thumb_pad]}}"  # on another link, as where one region is for several
+        text_there, message = text_and_message(text, line)
+        expected = 'no geom or mesh matches "thumb_pda"; did you mean "thumb_pad"?'
+        assert message == f"robot.layout.resolutions.low.palm.{dotted}: {expected}"
+        assert text_there.startswith("thumb_pda")
+    fine = "{geoms: {include: ['*'], exclude: [thumb_pad]}}"  # on another link, as when several links share a region
     resolved(folder, DOCUMENT.replace(f"palm: {PLACE}", f"palm: {patch.replace('REGION', fine)}"))
 
 
-def test_objects(folder):
+def test_unknown_objects_are_reported(folder):
     assert problems(folder, ("{body: cube}", "{body: cub}")) == [
         'd.yaml:18:24: objects.cube.body: no body is named "cub"; did you mean "cube"?'
     ]
@@ -112,7 +112,7 @@ def test_objects(folder):
     ]
 
 
-def test_what_can_never_be_in_contact(folder):
+def test_objects_that_never_touch_are_refused_behind_a_contact_gate(folder):
     place = "d.yaml:21:52: sensors.touch.feels[0]: "
     assert problems(folder, ("{body: cube}", "{body: ghost}")) == [
         f'{place}"cube" can never be in contact with a link of this sensor: the simulator does not collide them; '
@@ -130,13 +130,13 @@ def test_what_can_never_be_in_contact(folder):
 def test_a_scene_without_contacts_names_the_flag(folder, flag):
     scene = HAND.replace("<mujoco>", f'<mujoco><option><flag {flag}="disable"/></option>')
     (folder / "hand.xml").write_text(scene)
-    (found, *_) = problems(folder)
-    assert found.endswith(f'the scene\'s <option> has <flag {flag}="disable"/>; take it out, or use `gate: geometric`')
+    (message, *_) = problems(folder)
+    assert message.endswith(f'the scene\'s <option> has <flag {flag}="disable"/>; take it out, or use `gate: geometric`')
 
 
 @pytest.mark.filterwarnings("ignore::tgdsl.errors.UnfeltWarning")
-def test_pairs_that_never_meet_are_dropped_and_told(folder):
-    """The palm is the parent of its fingers, which MuJoCo does not collide with it; the fingers' tips it does."""
+def test_pairs_that_never_meet_are_dropped_and_listed(folder):
+    """MuJoCo does not collide the palm with its child bodies, only with the fingertips."""
     changes = DOCUMENT.replace("{body: cube}", "{body: thumb_1}")
     touch = tgdsl.compile({**_plain(folder, changes)})
     assert [(pair.link, pair.object) for pair in touch.inputs.pairs] == [("index_1", "cube"), ("index_2", "cube")]
@@ -181,10 +181,10 @@ def _robots() -> str:
 
 def test_a_placement_that_the_surface_cannot_satisfy(folder):
     grid = "{method: grid, rows: 2, columns: 2, direction: [0, 0, -1], radius: 1 mm, region: {box: {min: [1, 1, 1], max: [2, 2, 2]}}}"
-    found = problems(
+    messages = problems(
         folder, (f"        palm: {PLACE}", f"        palm: {grid}"), (f"        index_1: {PLACE}", f"        index_1: {grid}")
     )
-    assert [line.split(": ")[:3] for line in found] == [
+    assert [line.split(": ")[:3] for line in messages] == [
         ["d.yaml:12:15", "robot.layout.resolutions.low.palm", 'link "palm"'],
         ["d.yaml:13:18", "robot.layout.resolutions.low.index_1", 'link "index_1"'],
     ]
@@ -206,9 +206,9 @@ def test_eight_mistakes_are_eight_lines(folder, here):
     text = EIGHT.replace("        index_1: ", "        index_3: ").replace("objects: {", "objects: {ball: {body: bal}, ")
     text = text.replace('tips: ["*_2"]', 'tips: ["*_22"]')
     (folder / "bad.yaml").write_text(text)
-    code, said, error = here(folder, "compile", "bad.yaml")
+    code, output, error = here(folder, "compile", "bad.yaml")
     assert code == 2
-    assert said == ""
+    assert output == ""
     lines = error.splitlines()
     assert lines[-1] == f"{len(lines) - 1} mistakes"
     assert [tuple(line.split(": ")[:2]) for line in lines[:-1]] == [

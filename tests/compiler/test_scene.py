@@ -1,4 +1,4 @@
-"""Scenes out: just the sensors that are wanted, and an artefact that carries its scene wherever it is taken."""
+"""Scenes of artefacts: they have just the needed sensors and work from any folder."""
 
 import shutil
 from pathlib import Path
@@ -39,13 +39,13 @@ def inputs(*fields: str, links: tuple[str, ...] = ("pad", "tip"), slots: int = 0
 
 def sensors_of(model: mujoco.MjModel) -> dict[str, tuple[str, str, int]]:
     """Return body 1, body 2 and dimension of each contact sensor."""
-    found = {}
+    sensors = {}
     for i in range(model.nsensor):
         if model.sensor_type[i] == mujoco.mjtSensor.mjSENS_CONTACT:
             assert model.sensor_objtype[i] == model.sensor_reftype[i] == mujoco.mjtObj.mjOBJ_BODY
             bodies = (model.body(model.sensor_objid[i]).name, model.body(model.sensor_refid[i]).name)
-            found[model.sensor(i).name] = (*bodies, int(model.sensor_dim[i]))
-    return found
+            sensors[model.sensor(i).name] = (*bodies, int(model.sensor_dim[i]))
+    return sensors
 
 
 CASES = {
@@ -63,31 +63,31 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_instrument_adds_just_what_is_wanted_and_twice_is_once(case):
-    wanted, expected = CASES[case]
+def test_instrument_adds_just_the_needed_sensors_once(case):
+    needed, expected = CASES[case]
     spec = mujoco.MjSpec.from_string(TWO)
-    assert instrument(spec, wanted) is spec
+    assert instrument(spec, needed) is spec
     model = spec.compile()
     assert sensors_of(model) == expected
     assert model.nsensor == len(expected) + 1
-    assert model.sensor("mine").adr[0] == 0  # what was there stays where it was
-    again = instrument(spec, wanted).compile()
-    assert sensors_of(again) == expected
-    assert again.nsensor == model.nsensor
+    assert model.sensor("mine").adr[0] == 0  # existing sensors keep their addresses
+    repeated = instrument(spec, needed).compile()
+    assert sensors_of(repeated) == expected
+    assert repeated.nsensor == model.nsensor
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_kept_scene_has_the_same_sensors(tmp_path, case):
-    wanted, expected = CASES[case]
+    needed, expected = CASES[case]
     (tmp_path / "scene.xml").write_text(TWO)
-    kept = scene_model(scene_file(load_model(tmp_path / "scene.xml"), wanted))
+    kept = scene_model(scene_file(load_model(tmp_path / "scene.xml"), needed))
     assert sensors_of(kept) == expected
-    by_hand = instrument(mujoco.MjSpec.from_string(TWO), wanted).compile()
+    by_hand = instrument(mujoco.MjSpec.from_string(TWO), needed).compile()
     for name in ("sensor_type", "sensor_objid", "sensor_refid", "sensor_intprm", "sensor_dim", "sensor_adr"):
         np.testing.assert_array_equal(getattr(kept, name), getattr(by_hand, name), err_msg=name)
 
 
-def test_the_force_is_the_one_on_the_link_and_the_normal_points_out_of_the_object():
+def test_forces_act_on_the_link_and_normals_point_out_of_the_object():
     model = instrument(
         mujoco.MjSpec.from_string(TWO), inputs("contact_force", "contact_netforce", links=("pad",), slots=1)
     ).compile()
@@ -173,8 +173,8 @@ def main_under_the_included_files_meshdir(folder: Path) -> Path:
     )
 
 
-def files_of_one_name_beside_both(folder: Path) -> Path:
-    """MuJoCo takes those beside the main file."""
+def files_of_one_name_next_to_both(folder: Path) -> Path:
+    """MuJoCo takes the files next to the main one."""
     brick(folder / "a.stl", 0.02, 0.03, 0.04)
     brick(folder / "hand" / "a.stl", 0.05, 0.06, 0.07)
     inner = "<asset><mesh file='a.stl'/></asset><worldbody>" + body("{}", "a") + "</worldbody>"
@@ -234,7 +234,7 @@ SCENES = {
         included,
         included_under_the_main_files_meshdir,
         main_under_the_included_files_meshdir,
-        files_of_one_name_beside_both,
+        files_of_one_name_next_to_both,
         attached,
         one_name_in_two_folders,
         textured,
@@ -263,7 +263,7 @@ def same(found: mujoco.MjModel, expected: mujoco.MjModel) -> None:
 
 
 @pytest.mark.parametrize("make", SCENES)
-def test_scenes_are_kept_whole_and_found_from_anywhere(tmp_path, monkeypatch, make):
+def test_kept_scenes_load_from_any_folder(tmp_path, monkeypatch, make):
     main = SCENES[make](tmp_path / "project")
     model = load_model(main)
     kept = scene_file(model, NOTHING)
@@ -285,8 +285,8 @@ def test_scenes_do_not_depend_on_where_they_are_compiled(tmp_path, monkeypatch, 
     assert first == second
 
 
-def test_the_kept_text_names_no_folder(tmp_path):
-    """Moved to another folder, the scene has the same text and parts; only the assets' places differ."""
+def test_kept_scenes_contain_no_folder(tmp_path):
+    """In another folder, the scene has the same text and parts; only paths of assets differ."""
     kept = [scene_file(load_model(attached(tmp_path / name)), NOTHING) for name in ("one", "two")]
     assert kept[0].mjcf == kept[1].mjcf
     assert kept[0].parts == kept[1].parts
@@ -295,7 +295,7 @@ def test_the_kept_text_names_no_folder(tmp_path):
     assert str(tmp_path) not in kept[0].mjcf + "".join(kept[0].parts.values())
 
 
-def test_assets_that_have_changed_or_gone(tmp_path):
+def test_changed_or_missing_assets_are_refused(tmp_path):
     main = one_name_in_two_folders(tmp_path)
     kept = scene_file(load_model(main), NOTHING)
     brick(tmp_path / "right" / "tip.stl", 0.05, 0.06, 0.08)
@@ -354,10 +354,10 @@ def test_urdf_scenes(tmp_path, monkeypatch):
     model = load_model(tmp_path / "hand" / "hand.urdf")
     kept = scene_file(model, NOTHING)
     monkeypatch.chdir("/")
-    again = scene_model(kept)
-    assert again.nmesh == 2
+    loaded = scene_model(kept)
+    assert loaded.nmesh == 2
     for name in ("mesh_vert", "geom_pos", "geom_size"):
-        np.testing.assert_allclose(getattr(again, name), getattr(model.compiled, name), atol=1e-6)
+        np.testing.assert_allclose(getattr(loaded, name), getattr(model.compiled, name), atol=1e-6)
     assert str(tmp_path) not in kept.mjcf
 
 

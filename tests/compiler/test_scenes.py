@@ -1,4 +1,4 @@
-"""Objects that a document adds to a scene, and the scenes that come as examples."""
+"""Objects that a document adds to a scene, and the example scenes."""
 
 from pathlib import Path
 
@@ -33,19 +33,19 @@ def document(folder, objects, text=SCENE):
     }
 
 
-def test_an_object_of_its_own_falls_and_is_felt(tmp_path):
-    """A ball above the pad: its distance is that of its pose, its mass that of its density, and it comes to rest on the pad."""
+def test_an_added_object_falls_and_is_felt(tmp_path):
+    """A ball above the pad has the distance of its pose and the mass of its density, and lands on the pad."""
     doc = document(tmp_path, {"ball": {"geom": BALL, "pos": [0, 0, 0.2]}})
     touch = tgdsl.compile(doc, dtype=torch.float64)
     assert not touch.inputs.objects
     sim = tgdsl.simulate(touch, 2, substeps=5)
     assert touch(sim.state())["s"][0, 0, 0].item() == pytest.approx(0.2 - 0.11 - 0.02, abs=1e-9)
     assert sim.model.body("ball").mass[0] == pytest.approx(500 * 4 / 3 * np.pi * 0.02**3, rel=1e-9)
-    held = mujoco.MjModel.from_xml_string(SCENE)
-    assert sim.model.nq == held.nq + 7
+    bare_model = mujoco.MjModel.from_xml_string(SCENE)
+    assert sim.model.nq == bare_model.nq + 7
     for _ in range(200):
         sim.step()
-    assert abs(touch(sim.state())["s"][0, 0, 0].item()) < 5e-4  # on the pad, but for MuJoCo's soft contact
+    assert abs(touch(sim.state())["s"][0, 0, 0].item()) < 5e-4  # on the pad, within MuJoCo's soft contact
 
 
 @pytest.mark.parametrize(
@@ -60,13 +60,13 @@ def test_an_object_of_its_own_falls_and_is_felt(tmp_path):
         ((1, 1), {"contype": 0, "conaffinity": 0}, None),
     ],
 )
-def test_an_object_of_its_own_collides_with_whatever_bits_others_have(tmp_path, pad, given, bits):
-    """Unless it is given others. It comes to rest on the pad, or falls through."""
+def test_an_added_object_collides_whatever_bits_others_have(tmp_path, pad, given, bits):
+    """It rests on the pad, or falls through if its own bits do not match."""
     text = SCENE.replace("<worldbody>", f'<default><geom contype="{pad[0]}" conaffinity="{pad[1]}"/></default><worldbody>')
     doc = document(tmp_path, {"ball": {"geom": BALL, "pos": [0, 0, 0.14], **given}}, text)
     sim = tgdsl.simulate(tgdsl.compile(doc), 1, substeps=100)
-    own = sim.model.geom(sim.model.body("ball").geomadr[0])
-    assert bits is None or (own.contype[0], own.conaffinity[0]) == bits
+    geom = sim.model.geom(sim.model.body("ball").geomadr[0])
+    assert bits is None or (geom.contype[0], geom.conaffinity[0]) == bits
     for _ in range(2):
         sim.step()
     assert (sim.batch.qpos[0, 3] - sim.batch.qpos[0, 0] > 0.12) == (bits is not None)
@@ -96,8 +96,8 @@ def test_a_mesh_and_a_compound(tmp_path):
     np.testing.assert_allclose(reading, [0.2 - 0.02 - 0.11, 0.4 - 0.03 - 0.02 - 0.11], atol=5e-5)
     assert sim.model.body("cube").mass[0] == pytest.approx(1000 * 0.04**3, rel=1e-5)
     tgdsl.save(touch, tmp_path / "a.safetensors")
-    again = tgdsl.load(tmp_path / "a.safetensors", dtype=torch.float64)
-    np.testing.assert_array_equal(again(tgdsl.simulate(again, 1).state())["s"][0, 0].numpy(), reading)
+    loaded = tgdsl.load(tmp_path / "a.safetensors", dtype=torch.float64)
+    np.testing.assert_array_equal(loaded(tgdsl.simulate(loaded, 1).state())["s"][0, 0].numpy(), reading)
 
 
 def test_one_geom_instead_of_the_scenes(tmp_path):
@@ -123,7 +123,7 @@ def test_one_geom_instead_of_the_scenes(tmp_path):
         ({"geom": BALL, "quat": [0, 0, 0, 0]}, "is no orientation"),
     ],
 )
-def test_mistakes(tmp_path, target, message):
+def test_invalid_objects_are_refused(tmp_path, target, message):
     with pytest.raises(SpecError) as error:
         tgdsl.compile(document(tmp_path, {"item": target}))
     assert message in str(error.value), str(error.value)
@@ -136,8 +136,8 @@ def test_mistakes(tmp_path, target, message):
         ("short.stl", b"x" * 100, "in STL file 'short.stl'"),
     ],
 )
-def test_a_mesh_file_that_is_none(tmp_path, name, content, message):
-    """The mistake is where the document names the file, in the document's own words for it."""
+def test_an_invalid_mesh_file_is_reported(tmp_path, name, content, message):
+    """The message points to the file's name in the document and quotes it."""
     (tmp_path / name).write_bytes(content)
     path = str(tmp_path / name)
     with pytest.raises(SpecError) as error:
@@ -146,7 +146,7 @@ def test_a_mesh_file_that_is_none(tmp_path, name, content, message):
     assert message in str(error.value) and len(error.value.problems) == 1
 
 
-def test_a_name_that_the_scene_has(tmp_path):
+def test_an_added_object_needs_a_new_name(tmp_path):
     with pytest.raises(SpecError, match='the scene has a body "pad" already; `body: pad` gives that one these geoms'):
         tgdsl.compile(document(tmp_path, {"pad": {"geom": BALL}}))
 
@@ -174,8 +174,8 @@ def test_examples_are_touched_when_the_hand_closes(name, links, num_envs):
 
 
 @pytest.mark.parametrize("format", ["urdf", "usda"])
-def test_objects_for_a_robot_that_is_no_mjcf(tmp_path, format):
-    """The scene that is kept holds the new body once, at its exact place."""
+def test_objects_can_be_added_to_urdf_and_usd(tmp_path, format):
+    """The kept scene holds the new body once, at its exact position."""
     (tmp_path / "arm.urdf").write_text(
         '<robot name="arm"><link name="pad"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
         '</inertial><collision><geometry><box size=".1 .1 .02"/></geometry></collision></link></robot>'

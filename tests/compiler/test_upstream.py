@@ -1,4 +1,4 @@
-"""Sensors that read other sensors: order, once for all, before noise; circles and what is not there are mistakes."""
+"""Sensors that read other sensors: evaluated in order, once, before noise; cycles are refused."""
 
 import dataclasses
 from typing import Literal
@@ -25,7 +25,7 @@ class HeightSpec(LinkSpec):
 
 
 class SumSpec(AnySensorSpec):
-    """Sum of what others find."""
+    """Sum of other sensors."""
 
     kind: Literal["sum"]
     """Sum [m]."""
@@ -38,15 +38,15 @@ class SumSpec(AnySensorSpec):
 def height(gathered, context, constants, state):
     """Return heights."""
     CALLS.append("height")
-    made = gathered[LinkMotion].pos[2]
-    return {"z": made, "height": made}, {}
+    heights = gathered[LinkMotion].pos[2]
+    return {"z": heights, "height": heights}, {}
 
 
 def total(gathered, context, constants, state):
-    """Return the sum over all rows of all that is read, which others may read in turn."""
+    """Return the sum over all rows of all sources, for others to read in turn."""
     CALLS.append("sum")
-    made = torch.cat([planes["height"] for planes in gathered[Upstream].values()], dim=1).sum(dim=1, keepdim=True)
-    return {"z": made, "height": made}, {}
+    sums = torch.cat([planes["height"] for planes in gathered[Upstream].values()], dim=1).sum(dim=1, keepdim=True)
+    return {"z": sums, "height": sums}, {}
 
 
 def lower_height(spec, layout, surface_of):
@@ -56,12 +56,12 @@ def lower_height(spec, layout, surface_of):
 
 def lower_sum(spec, layout, surface_of):
     """A single row."""
-    asked = Upstream(sensors=spec.of, planes=HEIGHT, what="height")
-    return Lowered((Channel("z", "m"),), rows=Axis("sum", 1), upstream=asked, provides=HEIGHT)
+    request = Upstream(sensors=spec.of, planes=HEIGHT, what="height")
+    return Lowered((Channel("z", "m"),), rows=Axis("sum", 1), upstream=request, provides=HEIGHT)
 
 
 def undefined(spec, layout, gathered, context, state):
-    """Stand for a definition that no test needs."""
+    """Replace a definition that no test needs."""
     raise NotImplementedError
 
 
@@ -80,8 +80,8 @@ def build(tmp_path):
     return compiled
 
 
-def test_what_is_read_is_evaluated_before_and_once(build):
-    """Whatever the document's order, in which readings are handed out."""
+def test_sources_are_evaluated_first_and_once(build):
+    """Readings keep the document's order, whatever it is."""
     touch = build(
         twice={"kind": "sum", "of": ["one", "h"]}, one={"kind": "sum", "of": ["h"]}, h={"kind": "height", "links": "a"}
     )
@@ -94,8 +94,8 @@ def test_what_is_read_is_evaluated_before_and_once(build):
     torch.testing.assert_close(readings["twice"], 2 * readings["h"], rtol=0, atol=0)
 
 
-def test_what_is_read_is_without_noise(build):
-    """A sensor's noise, rate and history are its reading's alone."""
+def test_sources_are_read_without_noise(build):
+    """Noise, rate and history of a sensor affect only its own reading."""
     noisy = {"kind": "height", "links": "a", "noise": {"white_noise": 0.5}, "history": 3, "rate": 1.0}
     touch = build(one={"kind": "sum", "of": ["h"]}, h=noisy)
     for seed in range(3):
@@ -105,7 +105,7 @@ def test_what_is_read_is_without_noise(build):
     assert (readings["h"][:, -1, 0] - state.body_pos[:, 0, 2:]).abs().amin() > 0
 
 
-def test_by_default_all_that_provide_it_are_read(build):
+def test_by_default_all_providers_are_read(build):
     h = {"kind": "height", "links": "a"}
     touch = build((HEIGHTS, dataclasses.replace(SUM, provides=frozenset(), lower=_reads_alone)), one={"kind": "sum"}, h=h, g=h)
     state = touch.example_state(2)
@@ -116,20 +116,20 @@ def _reads_alone(spec, layout, surface_of):
     return dataclasses.replace(lower_sum(spec, layout, surface_of), provides=frozenset())
 
 
-def test_a_circle_is_a_mistake(build):
+def test_cycles_are_refused(build):
     with pytest.raises(SpecError, match=r"sensors\.one\.of: sensors read one another in a circle; one → two → one"):
         build(one={"kind": "sum", "of": ["two"]}, two={"kind": "sum", "of": ["one"]})
     with pytest.raises(SpecError, match=r"sensors\.own\.of: sensors read one another in a circle"):
         build(own={"kind": "sum", "of": ["own"]})
 
 
-def test_chosen_sensors_bring_all_that_they_read(build):
+def test_selected_sensors_bring_their_sources(build):
     h = {"kind": "height", "links": "a"}
     touch = build(only=["twice"], twice={"kind": "sum", "of": ["one"]}, one={"kind": "sum", "of": ["h"]}, h=h, g=h)
     assert [output.name for output in touch.outputs] == ["twice", "one", "h"]
 
 
-def test_a_reader_is_advanced_as_often_as_what_it_reads(build):
+def test_a_reader_advances_as_often_as_its_sources(build):
     def block(spec, layout, surface_of):
         return dataclasses.replace(lower_height(spec, layout, surface_of), substeps=2)
 
@@ -140,7 +140,7 @@ def test_a_reader_is_advanced_as_often_as_what_it_reads(build):
         build(kinds, one={"kind": "sum", "of": ["h"]}, h={"kind": "height", "links": "a"})
 
 
-def test_planes_that_are_promised_must_come(build):
+def test_promised_planes_must_be_returned(build):
     def without(gathered, context, constants, state):
         return {"z": gathered[LinkMotion].pos[2]}, {}
 

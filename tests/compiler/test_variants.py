@@ -1,4 +1,4 @@
-"""Objects that differ between environments: one batch gives what as many single runs give."""
+"""Objects that differ between environments: one batch equals as many single runs."""
 
 import json
 
@@ -28,7 +28,7 @@ ODD = [
     {"geoms": [{"type": "sphere", "size": [0.012], "pos": [0, 0, 0.02]}, {"type": "box", "size": [0.01, 0.01, 0.02]}]},
     {"geoms": [{"type": "capsule", "size": [0.01, 0.02]}, {"type": "box", "size": [0.02, 0.01, 0.005], "pos": [0, 0, 0.03]}]},
 ]
-"""Alone and compound, on and off the body's frame: places are shared by some and lacking in others."""
+"""Single and compound, on and off the body's frame: some share geoms of a shape, others lack them."""
 SENSORS = {
     "force": {"kind": "kinematic_taxel"},
     "depth": {"kind": "contact_depth", "gate": "geometric"},
@@ -50,8 +50,8 @@ def geom(variant) -> str:
         return "".join(geom(part) for part in variant["geoms"])
     size = f'size="{" ".join(map(str, variant["size"]))}" type="{variant["type"]}"' if "size" in variant else ""
     mesh = f'type="mesh" mesh="{variant["mesh"].removesuffix(".stl")}"' if "mesh" in variant else ""
-    place = "".join(f' {key}="{" ".join(map(str, variant[key]))}"' for key in ("pos", "quat") if key in variant)
-    return f"<geom {size}{mesh}{place}/>"
+    pose = "".join(f' {key}="{" ".join(map(str, variant[key]))}"' for key in ("pos", "quat") if key in variant)
+    return f"<geom {size}{mesh}{pose}/>"
 
 
 def document(folder, item: str, sensors=SENSORS, **target):
@@ -75,7 +75,7 @@ def document(folder, item: str, sensors=SENSORS, **target):
 
 
 def placed(value, folder):
-    """Return the same with the mesh files' names as those of files in a folder."""
+    """Return the same with mesh files' names as paths in a folder."""
     if isinstance(value, dict):
         return {k: str(folder / v) if k == "mesh" else placed(v, folder) for k, v in value.items()}
     return [placed(part, folder) for part in value] if isinstance(value, list) else value
@@ -89,8 +89,8 @@ def single_runs(folder, variants, state, **target):
     """Return the readings of each environment from a module whose scene has just its variant."""
     readings = []
     for env in range(state.body_pos.shape[0]):
-        own = variants[int(state.variant[env, 0])]
-        alone = tgdsl.compile(document(folder, geom(own), **target), dtype=torch.float64)
+        variant = variants[int(state.variant[env, 0])]
+        alone = tgdsl.compile(document(folder, geom(variant), **target), dtype=torch.float64)
         assert not alone.inputs.objects
         readings.append(alone(one_env(state, env, alone.inputs.fields)))
     return {name: torch.cat([reading[name] for reading in readings]) for name in readings[0]}
@@ -102,7 +102,7 @@ def cache(tmp_path_factory, monkeypatch):
 
 
 @pytest.mark.parametrize("variants", [[BOXES[0], BOXES[13], CYLINDERS[1]], ODD], ids=["alone", "compound"])
-def test_a_batch_of_variants_is_as_many_single_runs(tmp_path, variants):
+def test_a_batch_of_variants_equals_single_runs(tmp_path, variants):
     touch = tgdsl.compile(document(tmp_path, "<geom size='.01'/>", variants=variants), dtype=torch.float64)
     assert touch.inputs.objects == ("item",) and touch.inputs.num_variants == (len(variants),)
     state = touch.example_state(len(variants), spread=0.01)
@@ -127,16 +127,16 @@ def test_meshes_among_the_variants(tmp_path, target):
     for name, value in expected.items():
         torch.testing.assert_close(readings[name], value, rtol=1e-9, atol=1e-12, msg=lambda m, n=name: f"{n}: {m}")
     tgdsl.save(touch, tmp_path / "a.safetensors")
-    again = tgdsl.load(tmp_path / "a.safetensors", dtype=torch.float64)
-    torch.testing.assert_close(again(state)["force"], readings["force"], rtol=0, atol=0)
-    sim = tgdsl.simulate(again, 4)
+    loaded = tgdsl.load(tmp_path / "a.safetensors", dtype=torch.float64)
+    torch.testing.assert_close(loaded(state)["force"], readings["force"], rtol=0, atol=0)
+    sim = tgdsl.simulate(loaded, 4)
     sim.step()
-    assert again(sim.state())["depth"].shape == (4, 40, 1)
+    assert loaded(sim.state())["depth"].shape == (4, 40, 1)
 
 
 @pytest.mark.parametrize("size", ["fixed", "per_env"])
 def test_variants_and_sizes_against_the_reference(tmp_path, size):
-    """Also where a variant's size is given per environment: the box's and the cylinder's alike."""
+    """Also with a size per environment, for boxes and cylinders."""
     variants = ODD if size == "fixed" else [BOXES[0], CYLINDERS[0], {"type": "ellipsoid", "size": [0.01, 0.02, 0.03]}]
     sensors = {"s": {"kind": "kinematic_taxel", "gate": "geometric"}}
     doc = document(tmp_path, "<geom size='.01'/>", sensors, variants=variants, size=size)
@@ -149,7 +149,7 @@ def test_variants_and_sizes_against_the_reference(tmp_path, size):
 
 
 def test_sizes_per_environment(tmp_path):
-    """The scene's own geom, as large as the state says: what a fixed geom of that size gives, and its derivative."""
+    """A geom with a size from the state reads like a fixed one of that size, and has derivatives."""
     doc = document(tmp_path, '<geom type="box" size=".01 .01 .01"/>', size="per_env")
     touch = tgdsl.compile(doc, dtype=torch.float64)
     assert "variant" not in touch.inputs.fields
@@ -184,7 +184,7 @@ def test_one_compiled_graph_serves_all_variants(tmp_path):
 
 
 SAG = 1.2e-4
-"""What MuJoCo's soft contacts give way at rest [m], whatever the mass."""
+"""How far MuJoCo's soft contacts yield at rest [m], whatever the mass."""
 FALL = (
     '<mujoco><option timestep=".002"/><worldbody><body name="pad"><geom type="box" size="1 1 .1" pos="0 0 -.1"/></body>'
     '<body name="item" pos="0 0 .05"><freejoint/>{}</body></worldbody></mujoco>'
@@ -206,7 +206,7 @@ def falling(folder, item, **target):
 
 
 def test_the_simulator_has_the_same_objects_as_the_module(tmp_path):
-    """Boxes and cylinders fall on a plate with a probe: each comes to rest at its own height, as it does alone."""
+    """Boxes and cylinders fall on a plate with a probe: each rests at its own height, as it does alone."""
     touch = falling(tmp_path, '<geom size=".01" friction=".7"/>', variants=PAPER)
     sim = tgdsl.simulate(touch, 18, substeps=4)
     np.testing.assert_array_equal(sim.state().variant[:, 0], np.arange(18) % 16)
@@ -227,8 +227,8 @@ def test_the_simulator_has_the_same_objects_as_the_module(tmp_path):
     assert sim.batch.get_model(3).geom_friction[-1, 0] == 0.7
 
 
-def test_variants_whose_centre_of_mass_is_elsewhere(tmp_path):
-    """MuJoCo lays out the data of such bodies in another way; all environments still run together."""
+def test_variants_may_have_other_centres_of_mass(tmp_path):
+    """MuJoCo lays out data of such bodies differently; all environments still run together."""
     touch = falling(tmp_path, '<geom size=".01"/>', variants=[BOXES[0], ODD[3], ODD[1]])
     sim = tgdsl.simulate(touch, 3, substeps=4)
     for _ in range(200):
@@ -237,13 +237,13 @@ def test_variants_whose_centre_of_mass_is_elsewhere(tmp_path):
     assert sim.batch.qpos[0, 2] == pytest.approx(BOXES[0]["size"][2], abs=SAG)
     for env, variant in enumerate((BOXES[0], ODD[3], ODD[1])):
         alone = tgdsl.simulate(falling(tmp_path, geom(variant)), 1).model
-        body, found = alone.body("item").id, sim.batch.get_model(env)
-        np.testing.assert_allclose(found.body_mass[body], alone.body_mass[body], rtol=1e-12)
-        np.testing.assert_allclose(found.body_inertia[body], alone.body_inertia[body], rtol=1e-9)
-        np.testing.assert_allclose(found.body_ipos[body], alone.body_ipos[body], atol=2.1e-6)
+        body, variant_model = alone.body("item").id, sim.batch.get_model(env)
+        np.testing.assert_allclose(variant_model.body_mass[body], alone.body_mass[body], rtol=1e-12)
+        np.testing.assert_allclose(variant_model.body_inertia[body], alone.body_inertia[body], rtol=1e-9)
+        np.testing.assert_allclose(variant_model.body_ipos[body], alone.body_ipos[body], atol=2.1e-6)
 
 
-def test_sizes_and_variants_can_be_set_anew(tmp_path):
+def test_sizes_and_variants_can_be_changed(tmp_path):
     touch = falling(tmp_path, '<geom type="box" size=".01 .01 .01"/>', size="per_env")
     sim = tgdsl.simulate(touch, 3, substeps=4)
     np.testing.assert_array_equal(sim.state().object_size[:, 0], np.full((3, 3), 0.01))
@@ -270,7 +270,7 @@ def test_sizes_and_variants_can_be_set_anew(tmp_path):
     np.testing.assert_array_equal(sim.state().variant[:, 0], [0, 1, 1, 0])
 
 
-def test_what_a_state_may_hold(tmp_path):
+def test_invalid_variants_in_a_state_are_refused(tmp_path):
     touch = tgdsl.compile(document(tmp_path, "<geom size='.01'/>", variants=ODD))
     state = touch.example_state(4)
     assert touch(state.to(torch.float32))["depth"].shape == (4, 40, 1)
@@ -308,25 +308,25 @@ def test_what_a_state_may_hold(tmp_path):
         ({"size": "per_env", "body": "floor"}, 'the geoms of body "floor" are this object'),
     ],
 )
-def test_mistakes(tmp_path, target, message):
+def test_invalid_variants_are_refused(tmp_path, target, message):
     with pytest.raises(SpecError) as error:
         tgdsl.compile(document(tmp_path, "<geom size='.01'/>", **target))
     assert message in str(error.value), str(error.value)
     assert len(error.value.problems) == 1, str(error.value)
 
 
-def test_places_are_shared_in_order():
+def test_geoms_of_variants_are_aligned_in_order():
     columns, tables = aligned([["box"], ["sphere", "box"], ["box", "box"], []])
     assert columns == ("box", "sphere", "box")
     assert tables == [[0, None, None], [None, 0, 1], [0, None, 1], [None, None, None]]
 
 
-def test_the_same_document_is_the_same_plan(tmp_path):
+def test_the_same_document_gives_the_same_plan(tmp_path):
     first, second = (compile_document(document(tmp_path, "<geom size='.01'/>", variants=ODD)).plan for _ in range(2))
     assert first.to_json() == second.to_json() and json.loads(first.to_json())["scene"]["objects"][0]["name"] == "item"
 
 
-def test_models_that_no_environment_has_any_more_are_forgotten(tmp_path):
+def test_unused_models_are_dropped(tmp_path):
     touch = falling(tmp_path, '<geom type="box" size=".01 .01 .01"/>', size="per_env")
     sim = tgdsl.simulate(touch, 4)
     rng = np.random.default_rng(0)

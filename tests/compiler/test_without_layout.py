@@ -1,4 +1,4 @@
-"""A document whose sensors read no taxels needs no layout: its sensors are on any of the robot's bodies."""
+"""Sensors without taxels need no layout: they may be on any body of the robot."""
 
 import sys
 from pathlib import Path
@@ -47,8 +47,8 @@ def problems(text, kinds=()):
     return str(error.value).splitlines()
 
 
-def test_it_reads_what_it_reads_with_a_layout(folder):
-    """The same bodies, the same numbers; it is kept and loaded, and its account names no resolution."""
+def test_readings_are_the_same_with_and_without_a_layout(folder):
+    """The artefact loads, and its explanation names no resolution."""
     touch = tgdsl.compile("d.yaml")
     assert touch.plan.layout.num_taxels == 0 and touch.plan.origin.resolution == ""
     (folder / "full.yaml").write_text(DOCUMENT.replace("model: hand.xml", f"model: hand.xml, layout: {LAYOUT}"))
@@ -57,16 +57,16 @@ def test_it_reads_what_it_reads_with_a_layout(folder):
     full = tgdsl.compile("full.yaml")
     assert torch.equal(reading, full(state)["load"]) and reading[0, 0, 0] == 1 and reading[0, 0, 3] < -1
     tgdsl.save(touch, "d.safetensors")
-    kept = tgdsl.load("d.safetensors")
-    assert torch.equal(kept(state)["load"], reading)
-    text = kept.explain()
+    loaded = tgdsl.load("d.safetensors")
+    assert torch.equal(loaded(state)["load"], reading)
+    text = loaded.explain()
     assert text.startswith("hand.xml, 0 taxels\n") or "hand.xml, 0 taxels\n" in text
     assert "bodies  finger" in text and "at resolution" not in text + repr(touch)
     assert "at resolution low" in repr(full)
 
 
-def test_links_are_any_bodies_and_each_is_a_link_of_its_own(folder):
-    """A body without taxels, one without geoms: a row each. What is welded to a link, and is none itself, is part of it."""
+def test_any_body_is_a_separate_link(folder):
+    """Bodies without taxels or geoms get a row each; a body welded to a link is part of it unless it is listed."""
     assert tgdsl.compile("d.yaml").inputs.link_parts == {"finger": (ContactPart("subtree", "finger"),)}
     touch = tgdsl.compile("d.yaml", overrides={"sensors.load.links": ["finger", "skin", "camera"]}, dtype=torch.float64)
     assert touch.inputs.link_parts == {}
@@ -82,7 +82,7 @@ def test_a_kind_on_links_needs_none_either(folder):
 
 
 def test_kinds_on_taxels_need_one(folder):
-    """Alone or beside others, and where there are no sensors; a layout that is not there is missed at its own place."""
+    """Alone, with other kinds, and without sensors; a missing layout file is reported at its name."""
     assert problems(DOCUMENT.replace("link_contact", "contact")) == [MISSING]
     assert problems(DOCUMENT + "  touch: {kind: contact, links: finger, feels: [cube]}\n") == [MISSING]
     with pytest.raises(SpecError, match='robot: missing key "layout"'):
@@ -92,7 +92,7 @@ def test_kinds_on_taxels_need_one(folder):
     ]
 
 
-def test_what_cannot_be_without_a_layout_is_named(folder):
+def test_resolutions_and_unknown_links_are_refused_without_a_layout(folder):
     assert problems(DOCUMENT + "resolution: low\n") == [
         'd.yaml:6:13: resolution: there is no layout, which could have a resolution "low"; leave it out, or give the robot a layout'
     ]
@@ -104,8 +104,8 @@ def test_what_cannot_be_without_a_layout_is_named(folder):
     ]
 
 
-def test_commands(folder, here):
-    """`compile`, `explain` and `run` do their work; `render` says that there is nothing to draw."""
+def test_commands_work_without_a_layout(folder, here):
+    """`compile`, `explain` and `run` work; `render` reports that there is nothing to draw."""
     code, out, _ = here(folder, "compile", "d.yaml")
     assert code == 0 and out.startswith("0 taxels on 0 links\nsensors: load (link_contact, 1)\n")
     assert here(folder, "explain", "d.yaml")[0] == 0

@@ -34,30 +34,30 @@ def shapes(tmp_path):
 
 
 def cells(line: str) -> list[str]:
-    """Return the cells of a line: columns are two blanks apart at least."""
+    """Return the cells of a line: columns are at least two blanks apart."""
     return [cell for cell in line.strip().split("  ") if cell.strip()]
 
 
 def test_links_areas_have_closed_forms(shapes, here):
-    _, said, _ = here(shapes, "links", "shapes.xml")
-    lines = {line.split()[0]: line for line in said.splitlines() if not line.startswith(" " * 20)}
+    _, output, _ = here(shapes, "links", "shapes.xml")
+    lines = {line.split()[0]: line for line in output.splitlines() if not line.startswith(" " * 20)}
     for name, area, rtol in (
         ("box", 8 * (1 * 2 + 2 * 3 + 1 * 3), 1e-3),
         ("ball", 4 * np.pi * 2**2, 3e-3),
         ("rod", 2 * np.pi * 1 * (1 + 6), 2e-3),
     ):
-        found = next(float(cell) for cell in cells(lines[name])[1:] if cell.strip().replace(".", "").isdigit())
-        assert found == pytest.approx(area, rel=rtol), name
+        printed = next(float(cell) for cell in cells(lines[name])[1:] if cell.strip().replace(".", "").isdigit())
+        assert printed == pytest.approx(area, rel=rtol), name
 
 
 def test_links_table(shapes, here):
     layout = "groups: {first: box, others: {include: [ball, rod]}, all: [first, others]}\n"
     (shapes / "layout.yaml").write_text(layout + "resolutions: {low: {box: {method: poisson, count: 3, radius: 1 mm}}}\n")
-    code, said, error = here(shapes, "links", "shapes.xml", "--layout", "layout.yaml")
+    code, output, error = here(shapes, "links", "shapes.xml", "--layout", "layout.yaml")
     assert code == 0, error
-    assert said.splitlines() == links_table(load_model(shapes / "shapes.xml"), shapes / "layout.yaml")
+    assert output.splitlines() == links_table(load_model(shapes / "shapes.xml"), shapes / "layout.yaml")
     assert (
-        said
+        output
         == """\
 body         joints                     geoms                     area [cm²]  mass [g]  groups
 world                                   ground: plane, colliding   unbounded
@@ -72,15 +72,15 @@ world                                   ground: plane, colliding   unbounded
     )
 
 
-def test_links_of_a_robot_by_name_shows_its_own_groups(tmp_path, here):
-    code, said, error = here(tmp_path, "links", "xhand1")
+def test_links_of_a_robot_by_name_shows_its_groups(tmp_path, here):
+    code, output, error = here(tmp_path, "links", "xhand1")
     assert code == 0, error
-    (line,) = [line for line in said.splitlines() if line.strip().startswith("right_hand_mid_link2")]
+    (line,) = [line for line in output.splitlines() if line.strip().startswith("right_hand_mid_link2")]
     assert line.startswith("      right_hand_mid_link2 ") and line.endswith("tips, fingers, hand")
     assert "hinge 0 to 110 deg" in line
 
 
-def test_links_tells_the_mistakes_of_a_layout(shapes, here):
+def test_links_reports_mistakes_of_a_layout(shapes, here):
     (shapes / "layout.yaml").write_text(
         "groups: {first: bux}\nresolutions: {low: {box: {method: poisson, count: 3, radius: 1 mm}}}\n"
     )
@@ -91,34 +91,34 @@ def test_links_tells_the_mistakes_of_a_layout(shapes, here):
     assert (code, error) == (2, "none.yaml: cannot read this file: No such file or directory\n1 mistake\n")
 
 
-def test_links_shows_the_groups_of_the_layout_beside_a_file(shapes, here):
+def test_links_shows_the_groups_of_the_layout_next_to_a_file(shapes, here):
     rest = "resolutions: {low: {box: {method: poisson, count: 3, radius: 1 mm}}}\n"
     (shapes / "layout.yaml").write_text("groups: {first: box}\n" + rest)
-    code, said, error = here(shapes.parent, "links", f"{shapes.name}/shapes.xml")
+    code, output, error = here(shapes.parent, "links", f"{shapes.name}/shapes.xml")
     assert (code, error) == (0, "")
-    assert next(line for line in said.splitlines() if line.startswith("  box ")).endswith("  first")
+    assert next(line for line in output.splitlines() if line.startswith("  box ")).endswith("  first")
     (shapes / "layout.yaml").write_text("groups: {first: bux}\n" + rest)
     with warnings.catch_warnings():
         warnings.simplefilter("always")
-        code, said, error = here(shapes, "links", "shapes.xml")
-    assert code == 0 and "ball unlimited" in said and "first" not in said
-    what = "the layout next to this robot does not fit it, so no groups are shown"
+        code, output, error = here(shapes, "links", "shapes.xml")
+    assert code == 0 and "ball unlimited" in output and "first" not in output
+    hint = "the layout next to this robot does not fit it, so no groups are shown"
     assert error.startswith('tgdsl: warning: layout.yaml:1:17: groups.first: no link matches "bux"') and error.endswith(
-        f"; {what}\n"
+        f"; {hint}\n"
     )
 
 
-def test_bodies_without_a_name_are_called_by_their_way(tmp_path):
+def test_unnamed_bodies_are_identified_by_their_path(tmp_path):
     inner = "<body><geom size='.01'/><body name='{}'/><body><geom size='.01'/></body></body>"
     bodies = f"<body name='a'/>{inner.format('b')}<body name='c'>{inner.format('d')}</body>"
     (tmp_path / "r.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
     robot = load_model(tmp_path / "r.xml")
-    found = [robot.body_path(i) for i in range(robot.compiled.nbody)]
-    assert found == ["world", "a", "world/[2]", "b", "world/[2]/[2]", "c", "c/[1]", "d", "c/[1]/[2]"]
+    paths = [robot.body_path(i) for i in range(robot.compiled.nbody)]
+    assert paths == ["world", "a", "world/[2]", "b", "world/[2]/[2]", "c", "c/[1]", "d", "c/[1]/[2]"]
 
 
-def test_links_tells_what_presses_in_the_initial_pose(tmp_path, here):
-    """MuJoCo's own contact force: two balls on hinges that overlap by 1 mm."""
+def test_links_reports_contacts_in_the_initial_pose(tmp_path, here):
+    """Two balls that overlap by 1 mm, with MuJoCo's contact force."""
     model = tmp_path / "hand.xml"
     finger = '<body name="{}" pos="{} 0 0"><joint type="slide" axis="1 0 0"/><geom size=".01" mass="1"/></body>'
     model.write_text(

@@ -1,4 +1,4 @@
-"""Which taxels nothing can touch, on hands made for it: closed forms, and MuJoCo's own distances."""
+"""Taxels that nothing can touch, on made-up hands: closed forms and MuJoCo's distances."""
 
 import mujoco
 import numpy as np
@@ -16,15 +16,15 @@ MUJOCO_ATOL = 2e-6  # [m] MuJoCo's penetration depth converges to its `ccd_toler
 SIDES = pytest.mark.parametrize("side", [1, -1], ids=["right", "left"])
 
 
-def found(robot: Model, taxels: Layout, ignored: tuple[int, ...] = ()) -> list[tuple[str, str, list[int]]]:
+def unfelt_taxels(robot: Model, taxels: Layout, ignored: tuple[int, ...] = ()) -> list[tuple[str, str, list[int]]]:
     colliders = Colliders(robot)
     records = unfelt(colliders, taxels, reach(colliders, taxels, ignored))
-    return [(own.link, own.reason, own.taxels.tolist()) for own in records]
+    return [(record.link, record.reason, record.taxels.tolist()) for record in records]
 
 
 @SIDES
-def test_a_hollow_that_the_hull_fills(tmp_path, side):
-    """Inside an L's hull depths are known; a taxel is buried if that is more than its radius. The corner is as near to a side."""
+def test_taxels_in_a_hollow_of_the_hull_are_buried(tmp_path, side):
+    """Depths inside an L's hull are known; a taxel deeper than its radius is buried."""
     robot = model(tmp_path, f'<mujoco><asset>{shell("shell", side)}</asset><worldbody><body name="palm"><joint/>'
                             '<geom type="mesh" mesh="shell"/></body></worldbody></mujoco>')  # fmt: skip
     points = [[0.01, side * 0.01, 0.02], [0.01, side * 0.02, 0.02], [0.01, side * 0.03, 0.02], [0, side * 0.01, 0.02]]
@@ -39,8 +39,8 @@ def test_a_hollow_that_the_hull_fills(tmp_path, side):
         assert reach(colliders, layout({"palm": points}, radius)).is_buried.sum() == count
 
 
-def test_depths_are_those_of_mujoco(tmp_path):
-    """A tiny ball at the taxel is as deep in each shape, less its radius, as MuJoCo says: primitives, a hull, turned frames."""
+def test_depths_match_mujoco(tmp_path):
+    """MuJoCo's distance of a tiny ball at the taxel, less its radius: primitives, a hull, rotated frames."""
     shapes = (
         'type="sphere" size=".02"',
         'type="capsule" size=".01 .02"',
@@ -74,7 +74,7 @@ def test_depths_are_those_of_mujoco(tmp_path):
 
 
 @SIDES
-def test_every_reason_by_name(tmp_path, side):
+def test_every_reason_is_named(tmp_path, side):
     """One hand, left and right: hollow, welded plate, finger inside the palm, links not collided, an explicit pair."""
     robot = model(tmp_path, hand(side))
     at = side * np.array([0, 1, 0])
@@ -82,7 +82,7 @@ def test_every_reason_by_name(tmp_path, side):
         {
             "palm": [
                 [0.01, side * 0.02, 0.02],  # in the hollow
-                [0, side * 0.015, 0.02],  # on the outside, in the middle of the plate that is welded to it: 4 mm deep in that
+                [0, side * 0.015, 0.02],  # on the outside, 4 mm deep in the welded plate
                 [0, side * 0.025, 0.03],  # on the outside, free
                 [0.03, side * 0.005, 0.02],  # on the end, inside the finger
             ],
@@ -93,7 +93,7 @@ def test_every_reason_by_name(tmp_path, side):
         },
         radius=0.003,
     )
-    assert found(robot, taxels) == [
+    assert unfelt_taxels(robot, taxels) == [
         ("palm", BURIED, [0, 1]),
         ("palm", COVERED, [3]),
         ("plate", BURIED, [4]),
@@ -103,7 +103,7 @@ def test_every_reason_by_name(tmp_path, side):
     ]
     colliders = Colliders(robot)
     records = unfelt(colliders, taxels, reach(colliders, taxels))
-    assert [str(own) for own in records if own.reason != BURIED] == [
+    assert [str(record) for record in records if record.reason != BURIED] == [
         'palm: 1 of 4 taxels inside "finger" in the initial state',
         'finger: 1 of 2 taxels inside "palm" in the initial state',
         "the tip: 1 of 1 taxels on a body that the simulator does not collide",
@@ -112,23 +112,23 @@ def test_every_reason_by_name(tmp_path, side):
     assert unfelt_ids(records).tolist() == [0, 1, 3, 4, 6, 8, 9]
 
 
-def test_depth_in_a_welded_child_and_in_its_parent(tmp_path):
-    """Both are one rigid body: what of either is inside the other is as deep as the box and the hull are there."""
+def test_welded_bodies_bury_each_others_taxels(tmp_path):
+    """They are one rigid body, so depths are those in the box and in the hull."""
     robot = model(tmp_path, hand())
     taxels = layout({"palm": [[0, 0.015, 0.02]], "plate": [[0.005, 0, 0]]})
-    # The plate spans x from −8 to 4 mm, y from 10 to 20 mm: 4 mm to its near side. A point 3 mm behind the palm's side x = 0.
+    # The plate spans x from −8 to 4 mm, so its near side is 4 mm away. The other point is 3 mm behind the palm's side x = 0.
     np.testing.assert_allclose(reach(Colliders(robot), taxels).depth, [0.004, 0.003], rtol=0, atol=MESH_ATOL)
 
 
 def test_objects_and_the_ground_cover_nothing(tmp_path):
-    """A cube that floats into the palm is an object, and the plane through the hand is no link."""
+    """A cube that floats into the palm is an object; the plane through the hand is no link."""
     robot = model(tmp_path, hand().replace('pos="0 0.03 0"><freejoint/>', 'pos="0 0.03 .03"><freejoint/>'))
     inside_the_cube = layout({"palm": [[0, 0.03, 0.03]]})
-    assert found(robot, inside_the_cube) == []
+    assert unfelt_taxels(robot, inside_the_cube) == []
     sliding = model(tmp_path, hand().replace('pos="0 0.03 0"><freejoint/>', 'pos="0 0.03 .03"><joint type="slide"/>'))
-    assert found(sliding, inside_the_cube) == [("palm", COVERED, [0])]
+    assert unfelt_taxels(sliding, inside_the_cube) == [("palm", COVERED, [0])]
     cube = int(sliding.compiled.body("cube").id)
-    assert found(sliding, inside_the_cube, (cube,)) == []
+    assert unfelt_taxels(sliding, inside_the_cube, (cube,)) == []
 
 
 JAWS = """<mujoco><worldbody>
@@ -140,8 +140,8 @@ JAWS = """<mujoco><worldbody>
 </worldbody></mujoco>"""
 
 
-def test_links_that_hang_on_the_world(tmp_path):
-    """A base fixed to it and a jaw that slides on it are links to one another; a mocap body is none; no name is told so."""
+def test_links_fixed_to_the_world_cover_each_other(tmp_path):
+    """A fixed base and its sliding jaw cover each other; a mocap body covers nothing; unnamed bodies have a number."""
     robot = model(tmp_path, JAWS)
     taxels = layout({"base": [[0, 0, 0.01]], "jaw": [[0, 0, -0.01], [0, 0, 0.01], [0, 0.01, 0]]})
     colliders = Colliders(robot)
@@ -153,8 +153,8 @@ def test_links_that_hang_on_the_world(tmp_path):
     ]
 
 
-def test_a_ball_that_two_solids_cover_together(tmp_path):
-    """At the face where two boxes overlap by 2 mm a taxel is 1 mm deep in each; its ball is out of both from some radius on."""
+def test_two_overlapping_solids_can_bury_a_taxel_together(tmp_path):
+    """Where two boxes overlap by 2 mm, a taxel is 1 mm deep in each; only a large ball leaves both."""
     text = """<mujoco><worldbody><body name="link"><joint/>
       <geom type="box" size=".011 .02 .02" pos="-.01 0 0"/><geom type="box" size=".011 .02 .02" pos=".01 0 0"/>
       </body></worldbody></mujoco>"""
@@ -167,23 +167,23 @@ def test_a_ball_that_two_solids_cover_together(tmp_path):
 
 
 def test_links_face_to_face_cover_nothing(tmp_path):
-    """Boxes that share a face at rest, in frames where that is not representable."""
+    """Boxes share a face at rest, in frames where float64 cannot represent it."""
     text = """<mujoco><worldbody><body name="a" pos=".1 .7 .3" euler="13 29 31"><geom type="box" size=".01 .01 .01"/>
       <body name="b" pos=".02 0 0"><joint/><geom type="box" size=".01 .01 .01"/></body></body></worldbody></mujoco>"""
     taxels = layout({"a": [[0.01, 0, 0], [0.01, 0.01, 0.01]], "b": [[-0.01, 0, 0]]})
-    assert found(model(tmp_path, text), taxels) == []
+    assert unfelt_taxels(model(tmp_path, text), taxels) == []
 
 
-def test_inactive_taxels_feel_nothing_anyway(tmp_path):
+def test_inactive_taxels_are_not_reported(tmp_path):
     robot = model(tmp_path, hand())
-    assert found(robot, layout({"palm": [[0.01, 0.02, 0.02]], "the tip": [[0, 0, 0]]}, radius=0.0)) == []
+    assert unfelt_taxels(robot, layout({"palm": [[0.01, 0.02, 0.02]], "the tip": [[0, 0, 0]]}, radius=0.0)) == []
     none = layout({"palm": np.zeros((0, 3))})
-    assert found(robot, none) == [] and unfelt_ids(()).tolist() == []
+    assert unfelt_taxels(robot, none) == [] and unfelt_ids(()).tolist() == []
 
 
 @pytest.mark.parametrize("format", ["urdf", "usd"])
 def test_the_same_hand_from_other_formats(tmp_path, format):
-    """A box that reaches into its parent, in URDF, and in USD written from MJCF."""
+    """A box that reaches into its parent, in URDF and in USD written from MJCF."""
     urdf = """<robot name="r"><link name="a"><collision><geometry><box size=".02 .02 .02"/></geometry></collision></link>
       <link name="b"><collision><geometry><box size=".02 .01 .01"/></geometry></collision></link>
       <joint name="j" type="revolute"><parent link="a"/><child link="b"/><origin xyz=".015 0 0"/><axis xyz="0 1 0"/>
@@ -198,4 +198,4 @@ def test_the_same_hand_from_other_formats(tmp_path, format):
         write_usd(model(tmp_path, text), tmp_path / "r.usda")
         robot = load_model(tmp_path / "r.usda")
     taxels = layout({"a": [[0.01, 0, 0], [-0.01, 0, 0]], "b": [[-0.01, 0, 0], [0.01, 0, 0]]})
-    assert found(robot, taxels) == [("a", COVERED, [0]), ("b", COVERED, [2])]
+    assert unfelt_taxels(robot, taxels) == [("a", COVERED, [0]), ("b", COVERED, [2])]

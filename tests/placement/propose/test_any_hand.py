@@ -1,4 +1,4 @@
-"""Hands that nobody has described: from a robot file to readings by commands alone."""
+"""Unknown hands: from a robot file to readings, by commands alone."""
 
 import mujoco
 import numpy as np
@@ -10,11 +10,11 @@ from tgdsl.placement.propose.propose import escaped
 from tgdsl.schema.load import load_layout
 
 PRESSED = 0.0005
-"""How deep it is pressed into the skin [m]."""
+"""How deep the ball is pressed into the skin [m]."""
 DEPTH_ATOL = 1e-12
 """Everything is float64, half a metre from the origin."""
 DENSITY = 0.3e4
-"""Taxels per square metre, as the command is asked for."""
+"""Taxels per square metre, as given to the command."""
 LINES = {
     VISUAL: (
         "# Left out: floor: unnamed plane geom 4 of body floor has no bounded surface to put taxels on\n",
@@ -25,12 +25,12 @@ LINES = {
     ),
     CAPSULES: ('  tips: [tips, "f[[]2] end", "thumb end"]\n', "  palm: [palm]\n"),
 }
-"""What the file says, by hand."""
+"""Expected lines of the file."""
 
 
 @pytest.fixture(scope="module", params=HANDS)
 def odd(request, tmp_path_factory):
-    """A hand, and a folder where the command has made its layout."""
+    """Return a hand, and a folder where the command has written its layout."""
     folder = tmp_path_factory.mktemp(request.param)
     hand = HANDS[request.param]
     (folder / "hand.xml").write_text(hand.text)
@@ -40,7 +40,7 @@ def odd(request, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def touch(odd):
-    """The hand with a sensor on each group: the tips feel what MuJoCo has in contact with them, if it has anything."""
+    """Return the hand's module with a sensor on each group; tips are gated by MuJoCo's contacts if they collide."""
     hand, folder = odd
     gates = {"tips": "contact_pair"} if hand.collides else {}
     groups = ("hand", "tips", "fingers", *(("palm",) if hand.palm else ()))
@@ -48,7 +48,7 @@ def touch(odd):
 
 
 def test_from_the_file_to_readings(odd, touch):
-    """A ball pressed into the middle of each tip is felt as deep as its pose says; nothing else reads anything."""
+    """A ball pressed into the middle of each tip reads the depth of its pose; other taxels read 0."""
     hand, _ = odd
     sim = tgdsl.simulate(touch, 1)
     for _ in range(5):
@@ -63,14 +63,14 @@ def test_from_the_file_to_readings(odd, touch):
         assert readings["hand"][taxel] == pytest.approx(table["radius"][taxel] + PRESSED, abs=DEPTH_ATOL)
         assert not readings["hand"][expected == 0].any() and (expected == 0).any()
         rows = [np.flatnonzero(table["link"] == link) for link in dict.fromkeys(touch.taxels["tips"]["link"])]
-        for name, own in zip(dict.fromkeys(touch.taxels["tips"]["link"]), rows, strict=True):
-            found = readings["tips"][touch.taxels["tips"]["link"] == name]
+        for name, ids in zip(dict.fromkeys(touch.taxels["tips"]["link"]), rows, strict=True):
+            tip_readings = readings["tips"][touch.taxels["tips"]["link"] == name]
             is_felt = name == tip or not hand.collides  # contacts are with the pressed tip alone
-            np.testing.assert_allclose(found, expected[own] * is_felt, rtol=0, atol=DEPTH_ATOL)
+            np.testing.assert_allclose(tip_readings, expected[ids] * is_felt, rtol=0, atol=DEPTH_ATOL)
 
 
 def pressed(touch: tgdsl.TactileModule, sim, tip: str) -> tuple[int, np.ndarray]:
-    """Press the ball into the middle of a tip's taxels; return the middle one, and how deep each taxel feels it [m]."""
+    """Press the ball into the middle of a tip's taxels; return the middle taxel and all expected depths [m]."""
     table = touch.taxels["hand"]
     rows = np.flatnonzero(table["link"] == tip)
     pos = world_points(sim, table)
@@ -85,7 +85,7 @@ def pressed(touch: tgdsl.TactileModule, sim, tip: str) -> tuple[int, np.ndarray]
 
 
 def posed(sim) -> mujoco.MjData:
-    """Return MuJoCo's own kinematics of the first environment."""
+    """Return MuJoCo's kinematics of the first environment."""
     data = mujoco.MjData(sim.model)
     data.qpos[:] = sim.batch.qpos[0]
     mujoco.mj_kinematics(sim.model, data)
@@ -93,14 +93,14 @@ def posed(sim) -> mujoco.MjData:
 
 
 def world_points(sim, table: np.ndarray) -> np.ndarray:
-    """Return taxels in the world [m]."""
+    """Return positions of taxels in the world [m]."""
     data = posed(sim)
     bodies = [data.body(str(name)) for name in table["body"]]
-    turned = np.stack([body.xmat.reshape(3, 3) @ pos for body, pos in zip(bodies, table["pos"], strict=True)])
-    return turned + np.stack([body.xpos for body in bodies])
+    rotated = np.stack([body.xmat.reshape(3, 3) @ pos for body, pos in zip(bodies, table["pos"], strict=True)])
+    return rotated + np.stack([body.xpos for body in bodies])
 
 
-def test_what_a_hand_is_taken_for(odd, touch):
+def test_groups_and_inner_sides_are_recognised(odd, touch):
     hand, folder = odd
     groups = touch.plan.layout.groups
     assert set(groups["tips"]) == set(hand.tips)
@@ -115,7 +115,7 @@ def test_what_a_hand_is_taken_for(odd, touch):
         assert [part.facing for part in region] == ([] if facing is None else [facing]), name
 
 
-def test_the_file_says_what_was_left_out_and_what_is_a_guess(odd):
+def test_the_file_names_left_out_bodies_and_guesses(odd):
     hand, folder = odd
     text = (folder / "layout.yaml").read_text()
     for line in LINES.get(hand.text, ()):
@@ -123,7 +123,7 @@ def test_the_file_says_what_was_left_out_and_what_is_a_guess(odd):
 
 
 def test_counts_follow_the_resolution(odd):
-    """A quarter as many taxels at low as at med, rounded, but at least 1; four times as many at high."""
+    """`low` has a quarter of the taxels of `med`, at least 1; `high` has four times as many."""
     _, folder = odd
     placements = load_layout(folder / "layout.yaml").spec.resolutions
     for name, placement in placements["high"].items():
@@ -132,6 +132,6 @@ def test_counts_follow_the_resolution(odd):
         assert abs(med - 4 * low) <= 2 or low == 1
 
 
-def test_taxels_are_as_dense_as_asked(odd, touch):
+def test_taxels_have_the_requested_density(odd, touch):
     table = touch.taxels["hand"]
     assert len(table) / table["area"].sum() == pytest.approx(DENSITY, rel=0.05)

@@ -1,4 +1,4 @@
-"""A proposal that is changed before it is written: the text follows, and a compiled document has the taxels it asks for."""
+"""Changes of a proposal before it is written reach its text and the compiled taxels."""
 
 from pathlib import Path
 
@@ -32,13 +32,13 @@ def lines_of(draft: Draft) -> list[str]:
     return layout_text(draft.proposal, "hand.xml").splitlines()
 
 
-def test_another_density_of_some_links(tmp_path):
+def test_the_density_of_some_links_can_change(tmp_path):
     draft = draft_of(tmp_path)
-    before = lines_of(draft)
+    original = lines_of(draft)
     draft.change(TIPS, density=10e4)
     taxels = taxels_of(draft, tmp_path)
     assert [len(taxels[tip]) for tip in TIPS] == [round(TIP_AREA / 10)] * 2
-    changed = [line for line in lines_of(draft) if line not in before]
+    changed = [line for line in lines_of(draft) if line not in original]
     comment = "    # 4.8 cm², 10 taxels per cm², inner side guessed from how the joints close"
     assert comment in changed and {line.split(":")[0].strip() for line in changed} == {
         *TIPS,
@@ -52,7 +52,7 @@ def test_another_density_of_some_links(tmp_path):
         assert np.array_equal(shown.pos, taxels[tip]["pos"]) and np.array_equal(shown.normal, taxels[tip]["normal"])
 
 
-def test_a_density_of_all_links_gives_the_file_of_the_command(tmp_path, here):
+def test_one_density_for_all_links_gives_the_file_of_the_command(tmp_path, here):
     draft = draft_of(tmp_path)
     draft.change(TIPS, density=9e4)
     draft.change({link.name for link in draft.proposal.links}, density=7e4)
@@ -60,13 +60,13 @@ def test_a_density_of_all_links_gives_the_file_of_the_command(tmp_path, here):
     assert layout_text(draft.proposal, "hand.xml") == (tmp_path / "layout.yaml").read_text()
 
 
-def test_another_side_and_region(tmp_path):
+def test_sides_and_regions_can_change_and_return(tmp_path):
     draft = draft_of(tmp_path)
     guess = lines_of(draft)
     draft.change(["left_tip"], facing=(-1.0, 0.0, 0.0))
     low, high = draft.bounds("right_tip")
     draft.change(["right_tip"], box=((*low[:2], 0.016), high))
-    draft.change(["palm"], facing=(0.0, 0.0, 1.0))  # the guess is all around
+    draft.change(["palm"], facing=(0.0, 0.0, 1.0))  # the guess covers all sides
     taxels = taxels_of(draft, tmp_path)
     assert (taxels["left_tip"]["normal"] @ [-1, 0, 0]).min() > np.cos(np.radians(75))
     assert len(taxels["left_tip"]) == 19
@@ -91,7 +91,7 @@ def test_another_side_and_region(tmp_path):
     assert lines_of(draft) == guess
 
 
-def test_links_in_and_out_of_groups(tmp_path):
+def test_links_can_enter_and_leave_groups(tmp_path):
     draft = draft_of(tmp_path)
     guess = lines_of(draft)
     draft.set_group("tips", ["left_tip", "palm"])
@@ -121,10 +121,10 @@ def test_links_in_and_out_of_groups(tmp_path):
         ({"box": ((0.1, 0.1, 0.1), (0.2, 0.2, 0.2))}, 'link "palm": its surface has nothing in this region'),
     ],
 )
-def test_a_mistaken_change_changes_nothing(tmp_path, change, message):
+def test_an_invalid_change_changes_nothing(tmp_path, change, message):
     draft = draft_of(tmp_path)
-    before = draft.proposal
+    original = draft.proposal
     with pytest.raises(TgdslError) as error:
         draft.change(["palm"], **change)
     assert str(error.value).startswith(message)
-    assert draft.proposal is before
+    assert draft.proposal is original

@@ -1,4 +1,4 @@
-"""No taxel of a proposed layout is buried, covered or not collided unless the proposal says so; at every resolution."""
+"""At every resolution, no taxel of a proposed layout is buried, covered or not collided without a note."""
 
 import pytest
 from covered_hands import hand, shell
@@ -13,28 +13,30 @@ SIDES = pytest.mark.parametrize("side", [1, -1], ids=["right", "left"])
 
 
 def proposed(folder, here, text: str, *options: str) -> tuple[str, str]:
-    """Return the text of the layout that the command writes, and what it says."""
+    """Return the text of the layout that the command writes, and its output."""
     (folder / "hand.xml").write_text(text)
-    code, said, error = here(folder, "layout", "new", "hand.xml", *options)
+    code, output, error = here(folder, "layout", "new", "hand.xml", *options)
     assert code == 0, error
-    return (folder / "layout.yaml").read_text(), said
+    return (folder / "layout.yaml").read_text(), output
 
 
 def unfelt(folder) -> dict[str, list[str]]:
-    """Return the taxels that cannot feel of the layout that was written, by resolution."""
-    found = placed({"tgdsl": 1, "robot": {"model": str(folder / "hand.xml"), "layout": str(folder / "layout.yaml")}})
-    assert set(found.layouts) == set(FACTORS)
-    return {name: [str(own) for own in records] for name, records in found.unfelt.items()}
+    """Return the records of taxels of the written layout that cannot feel, by resolution."""
+    placement = placed({"tgdsl": 1, "robot": {"model": str(folder / "hand.xml"), "layout": str(folder / "layout.yaml")}})
+    assert set(placement.layouts) == set(FACTORS)
+    return {name: [str(record) for record in records] for name, records in placement.unfelt.items()}
 
 
 @SIDES
 def test_every_taxel_can_feel(tmp_path, here, side):
-    """The palm goes to its hull, and without what plate and finger cover; the plate and the finger lose what is in the palm."""
-    text, said = proposed(tmp_path, here, hand(side))
+    """The palm is sampled on its hull without covered parts; plate and finger lose the parts inside the palm."""
+    text, output = proposed(tmp_path, here, hand(side))
     assert unfelt(tmp_path) == {"low": [], "med": [], "high": []}
     placements = load_layout(tmp_path / "layout.yaml").spec.resolutions
     for name in FACTORS:
-        options = {link: (own.surface, own.exposed) for link, own in placements[name].items()}
+        options = {
+            link: (options_of_link.surface, options_of_link.exposed) for link, options_of_link in placements[name].items()
+        }
         assert options == {
             "palm": ("collision", True),
             "plate": ("mesh", True),
@@ -45,16 +47,16 @@ def test_every_taxel_can_feel(tmp_path, here, side):
     exposed = "without the parts that are inside other collision geoms in the initial state"
     assert f"    # {hull}\n    # {exposed}\n    palm: {{method: poisson, count: " in text
     assert "surface: collision, exposed: true" in text
-    lines = said.splitlines()
+    lines = output.splitlines()
     assert f"surface: collision: palm, thumb: {hull}" in lines and f"exposed: true: palm, plate, finger: {exposed}" in lines
     bare = '"the tip": the simulator does not collide it, so contacts never reach it'
     assert f"left out: {bare}" in lines and f"# Left out: {bare}\n" in text
-    assert "not collided" not in said
+    assert "not collided" not in output
 
 
 @SIDES
-def test_areas_are_those_of_what_is_sampled(tmp_path, side):
-    """Of the finger's box, 40 × 6 × 6 mm, the first 8 mm are inside the palm: an end and the last 32 mm of four sides are left."""
+def test_areas_are_those_of_the_sampled_surface(tmp_path, side):
+    """The first 8 mm of the finger's box of 40 × 6 × 6 mm are inside the palm: one end and 32 mm of four sides remain."""
     (tmp_path / "hand.xml").write_text(hand(side))
     links = {link.name: link for link in propose(load_model(tmp_path / "hand.xml"), 1e6, with_groups=False).links}
     assert links["finger"].facing is None
@@ -66,44 +68,44 @@ def test_areas_are_those_of_what_is_sampled(tmp_path, side):
 
 def test_a_link_that_others_cover_is_left_out(tmp_path, here):
     inner = '<body name="plug" pos=".005 .005 .02"><joint/><geom type="box" size=".003 .003 .003"/></body>'
-    text, said = proposed(tmp_path, here, hand().replace('<body name="plate"', f'{inner}<body name="plate"'))
-    assert "left out: plug: all of it is inside other links in the initial state" in said.splitlines()
+    text, output = proposed(tmp_path, here, hand().replace('<body name="plate"', f'{inner}<body name="plate"'))
+    assert "left out: plug: all of it is inside other links in the initial state" in output.splitlines()
     assert "    plug:" not in text and not any(unfelt(tmp_path).values())
 
 
-def test_a_robot_of_which_nothing_is_collided_keeps_its_taxels_and_says_so(tmp_path, here):
-    """They feel by distance, so they are kept; what cannot be felt by contact is named."""
-    text, said = proposed(tmp_path, here, HANDS["visual"].text)
-    mind = "none of these links collides in the simulator, so their taxels need `gate: geometric`"
-    assert f"# Note: {mind}.\n" in text and f"not collided: {mind}" in said.splitlines()
+def test_a_robot_without_colliders_keeps_its_taxels_with_a_note(tmp_path, here):
+    """They feel by distance, so they stay; those that contacts never reach are named."""
+    text, output = proposed(tmp_path, here, HANDS["visual"].text)
+    note = "none of these links collides in the simulator, so their taxels need `gate: geometric`"
+    assert f"# Note: {note}.\n" in text and f"not collided: {note}" in output.splitlines()
     assert "surface:" not in text and "exposed:" not in text
-    found = unfelt(tmp_path)["med"]
-    assert len(found) == 2 and all("on a body that the simulator does not collide" in own for own in found)
+    records = unfelt(tmp_path)["med"]
+    assert len(records) == 2 and all("on a body that the simulator does not collide" in record for record in records)
 
 
-def test_scenery_that_collides_does_not_make_a_hand_do_so(tmp_path, here):
-    """Jaws that are only seen keep their taxels beside a table that collides."""
+def test_colliding_scenery_does_not_count_as_the_hand(tmp_path, here):
+    """Visual jaws keep their taxels next to a colliding table."""
     table = '<body name="table" pos="0 0 -.5"><geom type="box" size=".2 .2 .1"'
-    text, said = proposed(tmp_path, here, HANDS["visual"].text.replace(table, f'{table} contype="1"'))
-    assert "not collided: " in said and '"jaw a": {method' in text
+    text, output = proposed(tmp_path, here, HANDS["visual"].text.replace(table, f'{table} contype="1"'))
+    assert "not collided: " in output and '"jaw a": {method' in text
 
 
-def test_options_only_where_they_are_needed(tmp_path, here):
-    """Links apart from one another that are convex, or whose hollows are no deeper than a taxel feels, get none."""
+def test_options_are_written_only_where_needed(tmp_path, here):
+    """Separate links get no options if they are convex, or if their hollows are shallower than taxels feel."""
     text = f"""<mujoco><asset>{shell()}</asset><worldbody><body name="palm"><geom type="box" size=".03 .03 .01"/>
       <body name="finger" pos="0 0 .02"><joint axis="0 1 0" range="0 1"/><geom type="capsule" size=".005 .01" pos="0 0 .01"/></body>
       <body name="shell" pos=".06 0 .02"><joint axis="0 1 0" range="0 1"/><geom type="mesh" mesh="shell"/></body>
     </body></worldbody></mujoco>"""
-    layout, said = proposed(tmp_path, here, text)
-    assert "exposed" not in said and "surface: collision: shell: " in said
+    layout, output = proposed(tmp_path, here, text)
+    assert "exposed" not in output and "surface: collision: shell: " in output
     assert not any(unfelt(tmp_path).values())
     # At 0.1/cm² the least radius is 12 mm; the hollow is 10 mm deep.
-    layout, said = proposed(tmp_path, here, text, "--density", "0.1/cm2", "--force")
+    layout, output = proposed(tmp_path, here, text, "--density", "0.1/cm2", "--force")
     assert "surface:" not in layout and "exposed:" not in layout and not any(unfelt(tmp_path).values())
 
 
 @pytest.mark.parametrize("robot", ["xhand1_right", pytest.param("sharpa_right", marks=pytest.mark.slow)])
-def test_the_hands_that_come_with_tgdsl_have_no_taxels_that_cannot_feel(robot):
-    """Of their own layouts, at every resolution."""
-    found = placed({"tgdsl": 1, "robot": {"model": robot}})
-    assert set(found.unfelt) == {"low", "med", "high"} and not any(found.unfelt.values())
+def test_taxels_of_included_hands_can_all_feel(robot):
+    """With their own layouts, at every resolution."""
+    placement = placed({"tgdsl": 1, "robot": {"model": robot}})
+    assert set(placement.unfelt) == {"low", "med", "high"} and not any(placement.unfelt.values())

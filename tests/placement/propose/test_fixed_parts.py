@@ -1,4 +1,4 @@
-"""Linkages whose tree hangs a finger on its tip, and what is fixed to links and palms: covers, towers, halves of a palm."""
+"""Linkages with fingers below their tips in the tree, and parts fixed to links and palms."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def facing_of(proposal: Proposal) -> dict[str, tuple[float, ...] | None]:
 
 
 def lever_finger(name: str, x: float, turn: int) -> str:
-    """Return a lever, on it the outer link of a finger, and on that the inner link, which a connect holds to the base."""
+    """Return a chain of a lever, a finger's outer link and its inner link, which a connect joins to the base."""
     hinge = '<joint {} axis="0 1 0" range="{}"/>'
     return f"""<body name="{name}_lever" pos="{x} 0 .01" euler="0 0 {turn}">{hinge.format(f'name="{name}_drive"', "0 60")}
       <geom type="box" size=".003 .006 .018" pos="0 0 .02"/>
@@ -32,8 +32,8 @@ def lever_finger(name: str, x: float, turn: int) -> str:
           <geom type="box" size=".003 .006 .018" pos="0 0 -.02"/></body></body></body>"""
 
 
-def test_a_tip_that_carries_the_rest_of_its_finger_in_the_tree_is_the_tip(tmp_path):
-    """Levers of 4 cm and inner links of 4 cm, 12 mm apart, are parallelograms: all their links are carried inward alike."""
+def test_a_tip_above_the_rest_of_its_finger_in_the_tree_is_the_tip(tmp_path):
+    """Levers and inner links of 4 cm, 12 mm apart, form parallelograms: all links move inward equally."""
     fingers = lever_finger("left", 0.04, 180) + lever_finger("right", -0.04, 0)
     loops = "".join(f'<connect body1="{side}_inner" body2="base" anchor="0 0 -.04"/>' for side in ("left", "right"))
     text = f'<body name="base"><geom type="box" size=".05 .02 .01"/>{fingers}</body>'
@@ -44,11 +44,11 @@ def test_a_tip_that_carries_the_rest_of_its_finger_in_the_tree_is_the_tip(tmp_pa
 
 
 TOWER = '<geom type="box" size=".02 .03 .05" pos="0 .07 .05"/>'
-"""It stands beside the gripper and is as high as its jaws, 0.1 m."""
+"""A tower next to the gripper, as high as its jaws: 0.1 m."""
 
 
 def test_a_tower_on_a_palm_has_no_taxels(tmp_path):
-    """The gripper's top has 4 · 6 · 2 cm²; the tower's top would have 24 cm² more, and shifts the palm's centre."""
+    """The gripper's top has 48 cm²; the tower's would add 24 cm² and shift the palm's centre."""
     text = world(slides().replace("<geom", f"{TOWER}<geom", 1))
     proposal = proposal_of(tmp_path, text)
     link = next(link for link in proposal.links if link.name == "gripper")
@@ -70,16 +70,16 @@ def test_a_tower_that_is_a_body_is_no_part_of_the_hand(tmp_path):
 
 
 def halves(order: str) -> str:
-    """Return a palm in two halves, fixed to one another, of which the second carries the fingers."""
+    """Return a palm in two fixed halves; the second carries the fingers."""
     text = palm_and_fingers(thumb(1))
     whole = '<geom type="box" size=".012 .04 .04" pos="0 0 .04"/>'
     half = '<geom type="box" size=".012 .02 .04" pos="0 {} .04"/>'
-    one, two = (half.format(y) for y in ((0.02, -0.02) if order == "thumb_first" else (-0.02, 0.02)))
+    first_half, second_half = (half.format(y) for y in ((0.02, -0.02) if order == "thumb_first" else (-0.02, 0.02)))
     assert whole in text
     return (
-        text.replace('<body name="palm" pos="0 0 .2">', f'<body name="first" pos="0 0 .2">{one}<body name="palm">').replace(
-            whole, two
-        )
+        text.replace(
+            '<body name="palm" pos="0 0 .2">', f'<body name="first" pos="0 0 .2">{first_half}<body name="palm">'
+        ).replace(whole, second_half)
         + "</body>"
     )
 
@@ -92,8 +92,8 @@ def test_both_halves_of_a_palm_are_the_palm(tmp_path, order):
 
 
 @pytest.mark.parametrize("z", [-0.03, 0.04], ids=["before", "beside"])
-def test_a_wrist_before_a_palm_is_no_part_of_it(tmp_path, z):
-    """A thumb that points back passes over a box fixed to the palm: below it is before the palm; as high as it is, its half."""
+def test_a_wrist_is_no_part_of_a_palm(tmp_path, z):
+    """A thumb points back over a box fixed to the palm: a box below is a wrist, one at its height a half of the palm."""
     wrist = f'<body name="wrist" pos="0 0 .2"><geom type="box" size=".012 .025 {abs(z)}" pos="0 -.02 {z}"/>'
     back = finger("thumb", ".02 -.02 0", "180 0 0")
     text = palm_and_fingers(back if z < 0 else thumb(1)).replace(
@@ -106,19 +106,19 @@ def test_a_wrist_before_a_palm_is_no_part_of_it(tmp_path, z):
     assert ("wrist" in {name for name, _ in proposal.left_out}) == (z < 0)
 
 
-def test_a_ball_that_nothing_holds_is_a_marker(tmp_path):
-    """Balls of 3 mm: one 60 mm before the palm, and one in the fingertip, which sticks out by 2 mm and is no tip of its own."""
+def test_a_ball_that_touches_nothing_is_a_marker(tmp_path):
+    """Balls of 3 mm: one 60 mm before the palm, and one in a fingertip, which sticks out by 2 mm."""
     ball = '<body name="{}" pos="{}"><geom size=".003"/></body>'
     text = palm_and_fingers(thumb(1) + ball.format("tool", ".08 0 .04"))
     geom = '<geom type="box" size=".006 .008 .014" pos="0 0 .016"/>'
-    place = text.index(geom, text.index('name="f1_3"')) + len(geom)
-    proposal = proposal_of(tmp_path, world(text[:place] + ball.format("mark", ".005 0 .02") + text[place:]))
+    index = text.index(geom, text.index('name="f1_3"')) + len(geom)
+    proposal = proposal_of(tmp_path, world(text[:index] + ball.format("mark", ".005 0 .02") + text[index:]))
     assert proposal.left_out == (("tool", "a marker: it touches nothing that it is fixed to"),)
     assert set(proposal.groups["tips"]) == {"f0_3", "f1_3", "f2_3", "f3_3", "thumb3"} and "mark" in proposal.groups["fingers"]
 
 
-def test_a_free_body_that_is_welded_to_a_link_is_part_of_it(tmp_path):
-    """Caps on two fingertips, each a tree of its own that an equality holds: they go with the tips, and face as these do."""
+def test_a_free_body_welded_to_a_link_is_part_of_it(tmp_path):
+    """Caps on two fingertips, separate trees held by equalities, count as tips and face like them."""
     box = '<geom type="box" size=".006 .008 .006"/>'
     caps = "".join(f'<body name="cap{i}" pos="0 {0.03 - 0.02 * i:.3g} .387"><freejoint/>{box}</body>' for i in range(2))
     welds = "".join(f'<weld body1="{one}" body2="{two}"/>' for one, two in (("f0_3", "cap0"), ("cap1", "f1_3")))
@@ -130,16 +130,16 @@ def test_a_free_body_that_is_welded_to_a_link_is_part_of_it(tmp_path):
     assert facing["cap0"] == facing["cap1"] == facing["f0_3"] == INNER
 
 
-def test_the_second_bar_of_a_linkage_faces_as_the_first(tmp_path):
-    """Its middle, at its hinge, is carried nowhere."""
+def test_the_second_bar_of_a_linkage_faces_like_the_first(tmp_path):
+    """Its centre lies at its hinge and does not move."""
     bar = '<geom type="box" size=".002 .006 .02" pos="0 0 .03"/>'
     text = parallel_jaws().replace(bar, bar.replace('pos="0 0 .03"', ""))
     facing = facing_of(proposal_of(tmp_path, text))
     assert facing["left_second"] == facing["right_second"] == INNER
 
 
-def test_covers_of_a_link(tmp_path):
-    """Behind a link, in front of another, and beside a third: the last faces as the link does, though it lies off its middle."""
+def test_covers_face_like_their_link(tmp_path):
+    """One cover lies behind its link, one in front and one at the side; the last faces like its link."""
     text = palm_and_fingers(thumb(1))
     parts = {
         "f0_2": '<body name="back"><geom type="box" size=".002 .008 .014" pos="-.008 0 .016"/></body>',
@@ -148,16 +148,16 @@ def test_covers_of_a_link(tmp_path):
     }
     geom = '<geom type="box" size=".006 .008 .014" pos="0 0 .016"/>'
     for name, part in parts.items():
-        place = text.index(geom, text.index(f'name="{name}"')) + len(geom)
-        text = text[:place] + part + text[place:]
+        index = text.index(geom, text.index(f'name="{name}"')) + len(geom)
+        text = text[:index] + part + text[index:]
     proposal = proposal_of(tmp_path, world(text))
     assert [name for name, why in proposal.left_out if why == HIDDEN] == ["back", "f1_3"]
     assert set(facing_of(proposal).values()) == {INNER}
     assert "pad" in proposal.groups["tips"] and "side" in proposal.groups["fingers"]
 
 
-def test_joints_that_spread_fingers_around_a_palm(tmp_path):
-    """Three fingers a third of a turn apart, straight at the start, bend both ways; their first joints swing them sideways."""
+def test_spreading_joints_do_not_turn_inner_sides(tmp_path):
+    """Three fingers at 120° bend both ways from straight; their first joints swing them sideways."""
     fingers = ""
     for i in range(3):
         knuckle = finger(f"f{i}_", "0 0 .02", num=2, span="-90 90")

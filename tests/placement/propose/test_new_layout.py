@@ -1,4 +1,4 @@
-"""A proposed layout: its file, its text and its mistakes."""
+"""A proposed layout: its file, its text and errors."""
 
 import pytest
 from odd_hands import FOUR_BAR, compiled
@@ -20,21 +20,21 @@ URDF = """<robot name="jaws">
 """
 
 
-def test_the_text_is_the_proposal(tmp_path, here):
-    """The file holds what the mapping does; of a URDF here, whose jaws close from opposite ends of their ranges."""
+def test_the_file_holds_the_proposal(tmp_path, here):
+    """A URDF gripper: its jaws close from opposite ends of their ranges."""
     (tmp_path / "jaws.urdf").write_text(URDF)
-    code, said, error = here(tmp_path, "layout", "new", "jaws.urdf", "--density", "1/cm2")
+    code, output, error = here(tmp_path, "layout", "new", "jaws.urdf", "--density", "1/cm2")
     assert code == 0, error
     proposal = propose(load_model(tmp_path / "jaws.urdf"), 1e4)
     assert load_layout(tmp_path / "layout.yaml").spec == LayoutSpec.model_validate(proposal.mapping())
-    found = {link.name: (link.facing, link.counts) for link in proposal.links}
-    assert found["left"] == ((1, 0, 0), {"low": 3, "med": 12, "high": 48})
-    assert found["right"] == ((-1, 0, 0), {"low": 3, "med": 12, "high": 48})
-    assert found["base"] == ((0, 0, 1), {"low": 25, "med": 100, "high": 400})
-    assert said.splitlines()[0] == "3 links: 31 taxels at low, 124 taxels at med, 496 taxels at high"
+    links = {link.name: (link.facing, link.counts) for link in proposal.links}
+    assert links["left"] == ((1, 0, 0), {"low": 3, "med": 12, "high": 48})
+    assert links["right"] == ((-1, 0, 0), {"low": 3, "med": 12, "high": 48})
+    assert links["base"] == ((0, 0, 1), {"low": 25, "med": 100, "high": 400})
+    assert output.splitlines()[0] == "3 links: 31 taxels at low, 124 taxels at med, 496 taxels at high"
 
 
-def test_without_groups(tmp_path, here):
+def test_groups_can_be_left_out(tmp_path, here):
     (tmp_path / "hand.xml").write_text(FOUR_BAR)
     assert here(tmp_path, "layout", "new", "hand.xml", "--groups", "none")[0] == 0
     layout = load_layout(tmp_path / "layout.yaml").spec
@@ -43,7 +43,7 @@ def test_without_groups(tmp_path, here):
 
 
 def test_the_geoms_of_a_link_are_named(tmp_path, here):
-    """A link of several geoms lists them; a layout may name one of them in its place."""
+    """A link of several geoms lists them, and a layout may name one of them instead."""
     body = """<body name="{0}" pos="{1} 0 -.02"><joint type="slide" axis="{2} 0 0" range="0 .02"/>
         <geom name="{0}_arm" type="box" size=".004 .01 .02"/><geom name="{0}_pad" type="box" size=".004 .01 .01" pos="0 0 -.03"/></body>"""
     fingers = body.format("left", -0.03, 1) + body.format("right", 0.03, -1)
@@ -86,7 +86,7 @@ def test_a_file_is_not_overwritten(tmp_path, here):
         ("1e9/cm2", 'link "base" would have'),
     ],
 )
-def test_a_density_that_is_none(tmp_path, here, density, message):
+def test_an_invalid_density_is_refused(tmp_path, here, density, message):
     (tmp_path / "hand.xml").write_text(FOUR_BAR)
     code, _, error = here(tmp_path, "layout", "new", "hand.xml", f"--density={density}")
     assert code == 2
@@ -103,7 +103,7 @@ def test_the_same_density_in_another_unit_gives_the_same_file(tmp_path, here):
     assert str(tmp_path) not in text
 
 
-def test_a_robot_without_surface_and_one_that_is_not_there(tmp_path, here):
+def test_robots_without_surface_and_missing_robots_are_refused(tmp_path, here):
     (tmp_path / "hand.xml").write_text('<mujoco><worldbody><body name="frame"/></worldbody></mujoco>')
     code, _, error = here(tmp_path, "layout", "new", "hand.xml")
     assert (code, error) == (2, 'tgdsl: hand.xml: no link has a surface for taxels ("frame": no geoms)\n')
@@ -112,7 +112,7 @@ def test_a_robot_without_surface_and_one_that_is_not_there(tmp_path, here):
         assert code == 2 and error.startswith('tgdsl: there is no file or robot "xhand2"; did you mean "xhand1')
 
 
-def test_names_that_yaml_and_selections_could_misread(tmp_path, here):
+def test_names_are_escaped_for_yaml_and_selections(tmp_path, here):
     names = ["no", "1e3", "a: b", "#c", "[d]", "*", "e?", 'f"g\\h', "i\u2028j", "😀", "- k", "hand", "{l}", "&m", "!n", "~"]
     parts = "".join(
         f'<body name="{name.replace("&", "&amp;").replace(chr(34), "&quot;")}"><joint axis="{1 + i} 1 0"/><geom type="box" size=".01 .01 .01" pos="{i} 0 0"/></body>'
@@ -125,7 +125,7 @@ def test_names_that_yaml_and_selections_could_misread(tmp_path, here):
     assert groups == {"tips": tuple(names), "fingers": tuple(names), "hand": tuple(names)}
 
 
-def test_a_shared_name_is_told(tmp_path, here):
+def test_a_shared_name_is_noted(tmp_path, here):
     text = FOUR_BAR.replace('name="left_rubber"', 'name="right_finger"')
     (tmp_path / "hand.xml").write_text(text)
     here(tmp_path, "layout", "new", "hand.xml")
@@ -133,22 +133,22 @@ def test_a_shared_name_is_told(tmp_path, here):
     assert line in (tmp_path / "layout.yaml").read_text()
 
 
-def test_links_that_are_called_as_groups_are_printed_plainly(tmp_path, here):
+def test_links_with_names_of_groups_are_printed_plainly(tmp_path, here):
     finger = '<body name="{}" pos="{} 0 0"><joint axis="0 1 0" range="0 90"/><geom size=".01"/></body>'
     fingers = finger.format("tips", 0.03) + finger.format("hand", -0.03)
     (tmp_path / "hand.xml").write_text(
         f'<mujoco><worldbody><body name="palm"><geom type="box" size=".03 .03 .01"/>{fingers}</body></worldbody></mujoco>'
     )
-    _, said, _ = here(tmp_path, "layout", "new", "hand.xml")
-    assert "group palm: palm\n" in said and "group tips: tips, hand\n" in said
+    _, output, _ = here(tmp_path, "layout", "new", "hand.xml")
+    assert "group palm: palm\n" in output and "group tips: tips, hand\n" in output
     text = (tmp_path / "layout.yaml").read_text()
     assert "  palm: [palm]\n" in text and '  tips: [tips, "[h]and"]\n' in text
     groups = compiled(tmp_path, {"hand": "geometric"}, "low").plan.layout.groups
     assert (groups["palm"], groups["tips"]) == (("palm",), ("tips", "hand"))
 
 
-def test_a_proposal_tells_which_link_it_samples(tmp_path):
+def test_a_proposal_reports_which_link_it_samples(tmp_path):
     (tmp_path / "hand.urdf").write_text(URDF)
-    said = []
-    propose(load_model(tmp_path / "hand.urdf"), 1e4, progress=said.append)
-    assert said == [f"sampling {name} ({i} of 3 links)" for i, name in enumerate(("base", "left", "right"), 1)]
+    output = []
+    propose(load_model(tmp_path / "hand.urdf"), 1e4, progress=output.append)
+    assert output == [f"sampling {name} ({i} of 3 links)" for i, name in enumerate(("base", "left", "right"), 1)]

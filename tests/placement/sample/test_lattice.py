@@ -1,4 +1,4 @@
-"""Lattices of lines against what they must hit: each place once, whatever triangles it is cut into."""
+"""Lattices of lines hit each point of a surface once, however it is triangulated."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from surfaces import plate
 
 from tgdsl.placement.sample import lattice
 
-TOLERANCE = 1e-15  # metres: centimetres in float64
+TOLERANCE = 1e-15  # metres: rounding of centimetres in float64
 
 
 @pytest.mark.parametrize("cuts", [1, 3])
@@ -28,40 +28,42 @@ def test_the_order_of_faces_makes_no_difference():
 
 
 def test_each_square_of_a_face_across_an_axis_has_one_point():
-    corners = np.array(box((0.08, 0.08, 0.02)).triangles)  # 64 by 64 squares of 1.25 mm, whose borders are at multiples
-    found = lattice.hits(corners, 0.00125, 0)
-    on_top = found.pos[found.pos[:, 2] == 0.01]
+    corners = np.array(box((0.08, 0.08, 0.02)).triangles)  # 64 by 64 squares of 1.25 mm
+    result = lattice.hits(corners, 0.00125, 0)
+    on_top = result.pos[result.pos[:, 2] == 0.01]
     square, counts = np.unique(np.floor(on_top[:, :2] / 0.00125), axis=0, return_counts=True)
     assert len(square) == 64 * 64
     assert (counts == 1).all()
-    np.testing.assert_array_equal(found.area, 0.00125**2)
+    np.testing.assert_array_equal(result.area, 0.00125**2)
     for offset in (on_top[:, :2] / 0.00125 % 1).T:
         assert stats.kstest(offset, "uniform").pvalue > 1e-3
 
 
 @pytest.mark.parametrize("turn", [(0, 0, 0), (0.5, 0.9, 0), (0.3, 0, 0.7), (0, 0.37, 0), (1.1, 0.6, 0.2)])
-def test_points_stand_for_the_area_of_a_plate_however_it_is_turned(turn):
+def test_points_represent_the_area_of_a_rotated_plate(turn):
     rotation = Rotation.from_euler("xyz", turn).as_matrix()
     corners = np.array(plate(np.array([0, 0, 1.0]), size=0.1).triangles) @ rotation.T
-    found = lattice.hits(corners, 1e-3, 1)
-    np.testing.assert_allclose(found.area.sum(), 0.01, rtol=0.02)  # some 10,000 points; a border's squares are partly on
+    result = lattice.hits(corners, 1e-3, 1)
+    np.testing.assert_allclose(
+        result.area.sum(), 0.01, rtol=0.02
+    )  # about 10,000 points; squares at the border are partly outside
     slope = np.abs(rotation[:, 2])
-    np.testing.assert_allclose(len(found.pos), slope[slope >= lattice.STEEP].sum() * 1e4, rtol=0.03)
+    np.testing.assert_allclose(len(result.pos), slope[slope >= lattice.STEEP].sum() * 1e4, rtol=0.03)
 
 
-def test_a_sliver_is_met_where_its_lines_say():
+def test_hits_on_a_sliver_lie_inside_it():
     corners = np.array([[[0, 0, 0], [1, 1, 0], [1, 1 + 1e-3, 0]]])
-    found = lattice.hits(corners, 1e-3, 0)
-    x, y = found.pos[:, 0], found.pos[:, 1]
+    result = lattice.hits(corners, 1e-3, 0)
+    x, y = result.pos[:, 0], result.pos[:, 1]
     assert ((y >= x) & (y <= x * (1 + 1e-3)) & (x <= 1)).all()
-    np.testing.assert_allclose(found.area.sum(), 5e-4, rtol=0.2)
+    np.testing.assert_allclose(result.area.sum(), 5e-4, rtol=0.2)
 
 
 def test_seeds_and_axes_draw_different_lines():
     corners = np.array(box((0.02, 0.02, 0.02)).triangles)
-    found = {seed: lattice.hits(corners, 1e-3, seed).pos for seed in (0, 1, 2**64 - 1, 10**30)}
-    assert len({pos.tobytes() for pos in found.values()}) == 4
-    sides = [np.sort(np.delete(found[0][found[0][:, axis] == 0.01], axis, axis=1), axis=0) for axis in range(3)]
+    positions = {seed: lattice.hits(corners, 1e-3, seed).pos for seed in (0, 1, 2**64 - 1, 10**30)}
+    assert len({pos.tobytes() for pos in positions.values()}) == 4
+    sides = [np.sort(np.delete(positions[0][positions[0][:, axis] == 0.01], axis, axis=1), axis=0) for axis in range(3)]
     assert not np.array_equal(sides[0], sides[1])
     assert not np.array_equal(sides[1], sides[2])
 

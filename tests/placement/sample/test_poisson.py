@@ -28,8 +28,8 @@ def test_poisson_gives_the_exact_count_evenly_on_the_surface(count):
     np.testing.assert_array_equal(samples.cell, np.full((count, 2), -1))
     _, face = KDTree(mesh.triangles_center).query(samples.pos, k=8)
     height = ((samples.pos[:, None] - mesh.triangles_center[face]) * mesh.face_normals[face]).sum(-1)
-    own = np.abs((samples.normal[:, None] * mesh.face_normals[face]).sum(-1) - 1).argmin(axis=1)
-    assert np.abs(height[np.arange(count), own]).max() < 1e-9  # in the plane of the face whose normal it has
+    nearest_face = np.abs((samples.normal[:, None] * mesh.face_normals[face]).sum(-1) - 1).argmin(axis=1)
+    assert np.abs(height[np.arange(count), nearest_face]).max() < 1e-9  # in the plane of the face with its normal
     if count >= 50:
         ideal = np.sqrt(2 * mesh.area / (np.sqrt(3) * count))  # hexagonal packing
         nearest = KDTree(samples.pos).query(samples.pos, k=2)[0][:, 1]
@@ -42,7 +42,7 @@ def test_poisson_gives_the_exact_count_evenly_on_the_surface(count):
         assert samples.area.std() / samples.area.mean() < 0.25
 
 
-def test_poisson_is_the_same_bytes_each_time_and_differs_by_seed():
+def test_poisson_is_repeatable_and_differs_by_seed():
     def bytes_of(seed: int, **keys: object) -> bytes:
         samples = sample(surface_of(box((0.01, 0.02, 0.03))), placement("poisson", seed=seed, **keys), HERE)
         return b"".join(getattr(samples, name).tobytes() for name in ("pos", "normal", "tangent", "area"))
@@ -53,7 +53,7 @@ def test_poisson_is_the_same_bytes_each_time_and_differs_by_seed():
 
 
 @pytest.mark.parametrize("spacing", [0.002, 0.0051, 0.1])
-def test_spacing_is_kept_and_leaves_no_gap(spacing):
+def test_samples_keep_their_spacing_without_gaps(spacing):
     surface = surface_of(box((0.02, 0.02, 0.01)))
     samples = sample(surface, placement("poisson", spacing=spacing), HERE)
     if len(samples.pos) > 1:
@@ -82,7 +82,7 @@ def test_poisson_samples_the_union_of_overlapping_boxes():
 
 
 @pytest.mark.parametrize(("shift", "size", "area"), [((2, 0, 0), (2, 2, 2), 40), ((1, 0, 0), (2, 2, 2), 32)])
-def test_poisson_counts_touching_and_flush_faces_as_the_union_does(shift, size, area):
+def test_poisson_counts_touching_and_flush_faces_once(shift, size, area):
     samples = sample(surface_of(box((2, 2, 2)), box(size, shift)), placement("poisson", count=300), HERE)
     np.testing.assert_allclose(samples.area.sum(), area, rtol=0.01)
     assert KDTree(samples.pos).query(samples.pos, k=2)[0][:, 1].min() > 0.2
@@ -113,20 +113,22 @@ def test_components_are_closed_if_they_have_no_border():
         mesh.apply_translation([0.03 * i, 0, 0])
     shell = meshlab.outer_shell(surface_of(trimesh.util.concatenate([whole, holed])))
     assert shell.is_solid.tolist() == [True, True] and shell.is_closed.tolist() == [True, False]
-    assert meshlab.outer_shell(surface_of(turned)).is_closed.tolist() == [True]  # cleaning makes the windings agree
+    assert meshlab.outer_shell(surface_of(turned)).is_closed.tolist() == [True]  # cleaning unifies the windings
 
 
 def test_visible_points_of_closed_meshes_need_no_winding_numbers(monkeypatch):
-    """A ball and, inside of it but for a cap, another: only points that the first directions do not see are num_asked for."""
+    """Another ball lies inside a ball except for a cap; only points hidden from the first directions need winding numbers."""
     num_asked, winding = list[int](), meshlab.Shell.winding
-    monkeypatch.setattr(meshlab.Shell, "winding", lambda own, i, pos: num_asked.append(len(pos)) or winding(own, i, pos))
+    monkeypatch.setattr(
+        meshlab.Shell, "winding", lambda shell_object, i, pos: num_asked.append(len(pos)) or winding(shell_object, i, pos)
+    )
     small = ball(0.005)
     small.apply_translation([0.01, 0, 0])
     surface = surface_of(trimesh.util.concatenate([ball(0.01), small]))
     shell = meshlab.outer_shell(surface)
     num_asked.clear()
     samples = poisson.pool(shell, Region(None, (), (), ()), seed=0, count=1, spacing=None)
-    # The circle in which they meet is at x = 8.75 mm: caps of 1.25 mm and of 3.75 mm are inside the other ball.
+    # They meet in a circle at x = 8.75 mm: caps of 1.25 mm and 3.75 mm are inside the other ball.
     outside = 2 * np.pi * (0.01 * 0.01875 + 0.005 * 0.00625)
     assert samples is not None and samples.area == pytest.approx(outside, rel=0.01)
     assert sum(num_asked) < 0.5 * len(samples.pos)
@@ -144,7 +146,7 @@ def test_poisson_on_open_meshes():
     assert np.linalg.norm(samples.pos, axis=1).min() > 0.0098  # a few missing triangles do not make a bowl
 
 
-def test_poisson_mends_windings_that_disagree():
+def test_poisson_repairs_inconsistent_windings():
     mesh = ball(0.01)
     faces = mesh.faces.copy()
     faces[::2] = faces[::2, ::-1]
@@ -160,7 +162,7 @@ def test_poisson_densifies_for_a_small_region():
     np.testing.assert_allclose(samples.area.sum(), np.pi * 0.0005**2, rtol=0.03)
 
 
-def test_poisson_errors(monkeypatch):
+def test_poisson_errors_say_what_to_change(monkeypatch):
     surface = surface_of(ball(0.01))
     away = placement("poisson", count=3, region={"box": {"min": [1, 1, 1], "max": [2, 2, 2]}})
     assert str(error_of(surface, away)) == "no part of the link's outer surface is in the region; widen `region`"
@@ -208,7 +210,7 @@ def test_pymeshlab_spreads_samples_evenly_over_the_region(keys):
     triangles = mesh.triangles[is_in]
     from_plane = ((samples.pos[:, None] - triangles[:, 0]) * mesh.face_normals[is_in]).sum(axis=2)
     of_normal = np.linalg.norm(samples.normal[:, None] - mesh.face_normals[is_in], axis=2).argmin(axis=1)
-    assert np.abs(from_plane[np.arange(len(samples.pos)), of_normal]).max() < 1e-9  # on the face whose normal it has
+    assert np.abs(from_plane[np.arange(len(samples.pos)), of_normal]).max() < 1e-9  # on the face with its normal
     nearest = KDTree(samples.pos).query(samples.pos, k=2)[0][:, 1]
     if "count" in keys:
         assert len(samples.pos) == keys["count"]
@@ -217,4 +219,4 @@ def test_pymeshlab_spreads_samples_evenly_over_the_region(keys):
     else:
         assert nearest.min() >= keys["spacing"]
         gaps = KDTree(samples.pos).query(triangles.mean(axis=1))[0]
-        assert gaps.max() <= 1.05 * keys["spacing"]  # as large as the pool's points lie apart
+        assert gaps.max() <= 1.05 * keys["spacing"]  # up to the distances of the pool's points

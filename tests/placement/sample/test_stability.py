@@ -1,4 +1,4 @@
-"""Rows of taxels do not depend on rounding: samples of a surface against those of the same surface as other files have it."""
+"""Rows of taxels do not depend on rounding: samples of a surface and of copies from other files agree."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from tgdsl.surfaces.surface import Surface
 ROBOTS = Path(__file__).parents[3] / "robots"
 PALMS = {"xhand1": "right_hand_link", "sharpa": "right_hand_C_MC"}
 SAME = 2e-6
-"""Metres: noise of 1e-7 over the least cosine of lattice and face, times what the largest of some hundred draws is."""
+"""Metres: noise of 1e-7 over the least cosine of lattice and face, times the largest of about a hundred draws."""
 SURFACES = {
     "ball": (surface_of(ball(0.01, subdivisions=3)), {"count": 120}),
     "box": (surface_of(box((0.02, 0.03, 0.05))), {"count": 200}),
@@ -38,7 +38,7 @@ SURFACES = {
 
 
 def equal_rows(one: Samples, other: Samples) -> float:
-    """Return the share of rows that are the same place."""
+    """Return the share of rows with the same position."""
     num = min(len(one.pos), len(other.pos))
     is_equal = np.abs(one.pos[:num] - other.pos[:num]).max(axis=1) < SAME
     return is_equal.sum() / max(len(one.pos), len(other.pos))
@@ -50,7 +50,7 @@ def palm(hand: str, ending: str = ".xml", folder: Path | None = None) -> Surface
 
 
 @pytest.mark.parametrize("name", SURFACES)
-def test_rows_stay_when_a_surface_is_written_otherwise(name):
+def test_rows_stay_when_vertices_are_rounded(name):
     surface, keys = SURFACES[name]
     shares = shares_of(surface, placement("poisson", **keys), {1e-8: 1, 1e-7: 2})
     assert min(shares[1e-8]) == 1.0
@@ -67,15 +67,15 @@ def test_rows_stay_when_a_surface_is_written_otherwise(name):
 def test_rows_stay_on_real_palms(hand, keys):
     surface, shares = palm(hand), {1e-8: [], 1e-7: []}
     for seed in range(2):
-        for noise, found in shares_of(surface, placement("poisson", **keys, seed=seed), {1e-8: 1, 1e-7: 1}).items():
-            shares[noise] += found
+        for noise, more_shares in shares_of(surface, placement("poisson", **keys, seed=seed), {1e-8: 1, 1e-7: 1}).items():
+            shares[noise] += more_shares
     assert min(shares[1e-8]) == 1.0
-    # Ten times what files in float32 differ by: a taxel that is replaced moves the rows between its old and new place.
+    # Ten times the rounding of float32 files; a replaced taxel shifts the rows between its old and new index.
     assert np.mean(shares[1e-7]) >= 0.95
 
 
 def shares_of(surface: Surface, where: Placement, draws: dict[float, int]) -> dict[float, list[float]]:
-    """Return the shares of equal rows of a surface and of copies with some noise [m], as many as asked for."""
+    """Return the shares of equal rows of a surface and of copies with noise, `{noise [m]: number of copies}`."""
     first = sample(surface, where, HERE)
     return {
         noise: [equal_rows(first, sample(shaken(surface, noise, seed), where, HERE)) for seed in range(num)]
@@ -85,7 +85,7 @@ def shares_of(surface: Surface, where: Placement, draws: dict[float, int]) -> di
 
 @pytest.mark.filterwarnings("ignore:.*USD holds no", "ignore:.*collides the convex hull")
 @pytest.mark.parametrize("hand", ["xhand1", pytest.param("sharpa", marks=pytest.mark.slow)])
-def test_rows_are_those_of_the_robot_that_was_exported_to_usd(hand, tmp_path):
+def test_rows_stay_when_a_robot_is_exported_to_usd(hand, tmp_path):
     export_model(ROBOTS / hand / f"{hand}_right.xml", tmp_path / f"{hand}_right.usda")
     palms = palm(hand), palm(hand, ".usda", tmp_path)
     for keys in ({"count": 297, "seed": 3}, {"spacing": 0.006}):
@@ -94,16 +94,16 @@ def test_rows_are_those_of_the_robot_that_was_exported_to_usd(hand, tmp_path):
         assert len(first.pos) == len(second.pos)
         np.testing.assert_allclose(second.pos, first.pos, rtol=0, atol=1e-6)
         np.testing.assert_allclose(second.normal, first.normal, rtol=0, atol=1e-4)
-        np.testing.assert_allclose(second.area, first.area, rtol=0.02)  # a point of the pool more or less in a cell
+        np.testing.assert_allclose(second.area, first.area, rtol=0.02)  # one more or less of the pool's points in a cell
 
 
 def test_rows_follow_one_direction():
-    found = sample(surface_of(ball(0.01, subdivisions=3)), placement("poisson", count=50), HERE)
-    assert (np.diff(found.pos @ np.sqrt([0.2, 0.3, 0.5])) > 0).all()
+    samples = sample(surface_of(ball(0.01, subdivisions=3)), placement("poisson", count=50), HERE)
+    assert (np.diff(samples.pos @ np.sqrt([0.2, 0.3, 0.5])) > 0).all()
 
 
 def soup(surface: Surface, noise: float, seed: int) -> Surface:
-    """The same surface as a file without shared vertices may have it: each corner of each face is off by itself."""
+    """Return the surface without shared vertices, with independent noise at each corner."""
     corners = surface.corners + np.random.default_rng(seed).uniform(-noise, noise, surface.corners.shape)
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
     return Surface(corners.reshape(-1, 3), faces, surface.face_geom, surface.geoms)
@@ -111,7 +111,7 @@ def soup(surface: Surface, noise: float, seed: int) -> Surface:
 
 @pytest.mark.parametrize("at", [0.0, 0.3])
 def test_rows_stay_when_faces_share_no_vertices(at):
-    """A ball within a ball, far from the origin: where corners are not joined, neither is closed and both have taxels."""
+    """A ball within a ball, far from the origin: if corners were not merged, both would get taxels."""
     center = (at, 0.5 * at, at)
     whole = surface_of(ball(0.005, center, subdivisions=3), ball(0.01, center, subdivisions=3))
     where = placement("poisson", count=60)
@@ -123,7 +123,7 @@ def test_rows_stay_when_faces_share_no_vertices(at):
 
 @pytest.mark.parametrize("name", ["ball", "spacing", "overlapping", "at_the_angle", "at_the_border"])
 def test_layouts_stay_whole_under_noise_of_float32(name):
-    """8 copies of each of five surfaces, with vertices off by 1e-7 of the largest coordinate: no row of any moves."""
+    """8 copies of each surface, with noise of 1e-7 of the largest coordinate, keep all rows."""
     surface, keys = SURFACES[name]
     shares = shares_of(surface, placement("poisson", **keys), {1e-7 * float(np.abs(surface.vertices).max()): 8})
-    assert [found for own in shares.values() for found in own] == [1.0] * 8
+    assert [share for values in shares.values() for share in values] == [1.0] * 8
