@@ -1,4 +1,4 @@
-"""Actuation audio: against its float64 reference, and its spectrum, level and phase in closed form."""
+"""Actuation audio against its float64 reference, and its spectrum, level and phase in closed form."""
 
 import numpy as np
 import pytest
@@ -29,13 +29,13 @@ class TestActuationAudio(KindConformance):
     parameters = {"samples": 17, "friction": 1e-4, "hum": 1e-3, "hum_frequency": 70.0, "partials": [1.0, 0.0, 0.4, 0.3, 0.2]}
     gates = ()
     float64_tolerance = 1e-6
-    """Normal numbers are by Taylor series, to 3e-7."""
+    """Normal numbers use Taylor series, accurate to 3e-7."""
     is_differentiable = False
-    """Noise is another one at each call; see the block without it."""
+    """Noise differs at each call; see the block without it."""
 
     @pytest.fixture
     def scene(self, tmp_path_factory):
-        """The conformance scene with three joints, of which two are actuated."""
+        """The conformance scene with three joints, two of them actuated."""
         path = tmp_path_factory.getbasetemp() / "conformance_joints.xml"
         path.write_text(SCENE.replace("</worldbody>", JOINTS))
         return path
@@ -56,7 +56,7 @@ class TestActuationAudio(KindConformance):
             assert state.joint_effort.abs().amin() > 0 and (module(state)["s"] == 0).all()
 
     def test_a_broken_pose_is_seen(self, scene):
-        """Not-a-number in a velocity is heard as such, until the next episode."""
+        """A NaN in a velocity is heard until the next episode."""
         module, _ = self.build(self.document(scene), torch.float32)
         first, second, third = self.states(module, 2)
         module(first)
@@ -90,7 +90,7 @@ class TestActuationAudioBlock(TestActuationAudio):
             assert (module(state)["s"] == 0).all()
 
     def test_a_broken_pose_is_seen(self, scene):
-        """Not-a-number in a velocity is heard in what follows."""
+        """A NaN in a velocity is heard in the rest of the block."""
         module, _ = self.build(self.document(scene), torch.float32)
         state = module.example_state(1)
         state.substeps[1].joint_vel[0, 1] = torch.nan
@@ -111,14 +111,14 @@ def build(tmp_path):
     return compiled
 
 
-def test_partials_are_at_multiples_of_the_pitch_as_strong_as_said():
-    """At 8 rad/s and 100 Hz per rad/s: peaks at 800, 1600, 2400 Hz, of ℓ a_h."""
-    found = oracles.partials()
-    assert found.at == ("800 Hz", "1600 Hz", "2400 Hz")
+def test_partials_have_their_frequencies_and_levels():
+    """At 8 rad/s and 100 Hz per rad/s: peaks of ℓ a_h at 800, 1600 and 2400 Hz."""
+    comparison = oracles.partials()
+    assert comparison.at == ("800 Hz", "1600 Hz", "2400 Hz")
 
 
-def test_nothing_jumps_where_a_joint_turns_back_or_load_sets_in(build):
-    """Between steps samples differ no more than within: no click."""
+def test_reversals_and_load_steps_do_not_click(build):
+    """Samples differ no more between steps than within them."""
     touch = build(load=0.1, power=0.1, partials=[1.0, 0.5])
     velocities = 3.0 * np.cos(2 * np.pi * 5 * np.arange(300) * 1e-3)
     efforts = np.where(np.arange(300) < 150, 0.1, 2.0)
@@ -128,8 +128,8 @@ def test_nothing_jumps_where_a_joint_turns_back_or_load_sets_in(build):
     assert between.max() <= 1.05 * within.max() and within.max() > 0
 
 
-def test_noise_is_counted(build):
-    """The same seed gives the same samples, another one others; an environment's are its own in every batch."""
+def test_noise_depends_only_on_seed_and_environment(build):
+    """A seed repeats its samples, another one gives others; an environment has its samples in every batch."""
     velocities = np.full(3, 3.0)
     first = driven(build(friction=1e-3), velocities, 0.0, num_envs=3)
     np.testing.assert_array_equal(driven(build(friction=1e-3), velocities, 0.0, num_envs=3), first)
@@ -140,15 +140,15 @@ def test_noise_is_counted(build):
 def test_single_precision_keeps_the_phase(build):
     """After 1,250 turns of the phase, at a varying speed, samples are off by less than 1e-3 of the amplitude."""
     velocities = 5.0 + 2.0 * np.sin(np.arange(1000) * 0.01)
-    found = [
+    samples = [
         driven(build(dtype, load=1.0, partials=[1.0], pitch=250.0), velocities, 1.0)[0][-200:]
         for dtype in ("float64", "float32")
     ]
-    np.testing.assert_allclose(found[1], found[0], atol=1e-3)
+    np.testing.assert_allclose(samples[1], samples[0], atol=1e-3)
 
 
-def test_in_a_simulation_it_reads_the_joints_of_the_same_instant(build):
-    """Of MuJoCo's own velocity and actuator force, at each physics step of a control step."""
+def test_a_simulation_reads_the_joints_of_the_same_instant(build):
+    """MuJoCo's velocity and actuator force, at each physics step of a control step."""
     touch = build(load=0.1, substeps=2, partials=[1.0], samples=10)
     sim = tgdsl.simulate(touch, 1, substeps=2)
     single = build(load=0.1, partials=[1.0], samples=10)
@@ -173,12 +173,12 @@ def test_in_a_simulation_it_reads_the_joints_of_the_same_instant(build):
         ({"load": 1.0, "links": "arm"}, r"sensors\.motors\.links: unknown key"),
     ],
 )
-def test_mistakes_are_located(build, fields, message):
+def test_mistakes_name_their_place(build, fields, message):
     with pytest.raises(SpecError, match=message):
         build(**fields)
 
 
-def test_a_robot_without_actuators_has_none(tmp_path):
+def test_a_robot_without_actuators_is_a_mistake(tmp_path):
     (tmp_path / "scene.xml").write_text(SCENE)
     sensors = {"motors": {"kind": "actuation_audio"}}
     with pytest.raises(SpecError, match=r"sensors\.motors: the robot has no actuated joints"):

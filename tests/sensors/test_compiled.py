@@ -1,4 +1,4 @@
-"""One module of every kind, with memory, in one compiled graph; `make test-full` compiles each kind with its noise by itself."""
+"""One module of all kinds, with memory, in one compiled graph; `make test-full` compiles each kind with its noise alone."""
 
 import torch
 from every_kind import SENSORS, every_kind
@@ -12,11 +12,11 @@ from tgdsl.tensors.torch_internals import num_compiled_graphs
 from tgdsl.testing import full_scale_error
 
 NOISY = ("contact", "touch")
-"""Sensors whose noise is compiled: of bools with hysteresis, and every stage with a history."""
+"""Sensors whose noise is compiled: bits with hysteresis, and all stages with a history."""
 
 
 def test_all_kinds_in_one_graph(tmp_path):
-    """Compiled readings are the eager ones, over states with memory and a reset, at two numbers of environments.
+    """Compiled readings equal eager ones, over states with memory and a reset, at two numbers of environments.
 
     No number of the code or the plan is an input of the graph.
     """
@@ -42,15 +42,15 @@ def test_all_kinds_in_one_graph(tmp_path):
 
 
 def assert_same_readings(compiled, eager, calls, num_envs):
-    """Assert that readings of all calls together agree, of which the last one follows a reset of two environments."""
-    found, expected = [], []
+    """Assert that the readings of all calls agree; the last call follows a reset of two environments."""
+    actual, expected = [], []
     for call in calls:
-        for module, readings in ((compiled, found), (eager, expected)):
+        for module, readings in ((compiled, actual), (eager, expected)):
             if call == calls[-1]:
                 module.reset([1, 3])
             readings += read(module, range(call, call + 1), num_envs)
-    assert found[0].keys() == expected[0].keys() and len(found[0]) > len(SENSORS)
-    for name in found[0]:
-        compared, exact = (torch.stack([reading[name] for reading in readings]) for readings in (found, expected))
+    assert actual[0].keys() == expected[0].keys() and len(actual[0]) > len(SENSORS)
+    for name in actual[0]:
+        compared, exact = (torch.stack([reading[name] for reading in readings]) for readings in (actual, expected))
         assert exact.isfinite().all() and (exact != 0).any(), name
         assert full_scale_error(compared, exact.double().numpy()).max() < FLOAT32_TOLERANCE, name

@@ -10,7 +10,7 @@ from tgdsl.testing import KindConformance
 class TestContact(KindConformance):
     kind = CONTACT
     is_differentiable = False
-    test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
+    test_compiled_equals_eager = None  # its graph is part of another kind's
 
 
 class TestContactWithHysteresis(KindConformance):
@@ -23,7 +23,7 @@ SPHERE = '<geom type="sphere" size=".02"/>'
 
 
 def bits(touch, depths):
-    """Press a 10 mm probe at the origin to one depth after the other, in mm."""
+    """Return the bits of a 10 mm probe at the origin, pressed to each depth in turn, in mm."""
     return [int(touch(state(touch, pos=[0.03 - 1e-3 * depth, 0, 0]))["s"].item()) for depth in depths]
 
 
@@ -39,7 +39,7 @@ def test_default_threshold_is_the_papers(tmp_path):
     assert bits(touch, [0.49, 0.51]) == [0, 1]
 
 
-def test_bits_are_of_the_modules_dtype(tmp_path):
+def test_bits_have_the_modules_dtype(tmp_path):
     touch = module(tmp_path, [(0, 0, 0)], SPHERE, kind="contact", dtype=torch.float32)
     assert touch(state(touch))["s"].dtype == torch.float32
 

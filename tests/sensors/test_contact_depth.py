@@ -10,21 +10,21 @@ from tgdsl.testing import KindConformance
 
 
 class TestContactDepth(KindConformance):
-    test_compiled_equals_eager = None  # its graph is part of that of kinematic taxels
+    test_compiled_equals_eager = None  # its graph is part of the one of kinematic taxels
     kind = CONTACT_DEPTH
 
 
 def test_a_probe_reaches_its_radius_and_no_further():
-    """A 4 cm cube and a radius of 10 mm: the right depth at every clearance, near or far compared with the cube."""
-    found = geometry.reach()
-    assert found.paper_error == pytest.approx(5e-3)
+    """A 4 cm cube and a radius of 10 mm: the depth is right at every clearance, near or far compared with the cube."""
+    comparison = geometry.reach()
+    assert comparison.paper_error == pytest.approx(5e-3)
 
 
 def test_the_deepest_geom_of_a_compound_wins(tmp_path):
     geoms = '<geom type="sphere" size=".01"/><geom type="sphere" size=".01" pos=".03 0 0"/>'
     touch = module(tmp_path, [(0.012, 0, 0), (0.015, 0, 0), (0.02, 0, 0)], geoms, kind="contact_depth")
-    found = touch(state(touch))["s"][0, :, 0].numpy()
-    np.testing.assert_allclose(found, [0.008, 0.005, 0.01], atol=1e-15)
+    depth = touch(state(touch))["s"][0, :, 0].numpy()
+    np.testing.assert_allclose(depth, [0.008, 0.005, 0.01], atol=1e-15)
 
 
 def test_a_filler_reads_zero_even_deep_inside(tmp_path):

@@ -1,4 +1,4 @@
-"""Scenes that break touch sensors: contact at rest on a corner, ties, deep overlap, fast spin, careless quaternions."""
+"""Scenes that break touch sensors: resting contact on a corner, ties, deep overlap, fast spin, careless quaternions."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def two_cubes(tmp_path, dtype=torch.float64, bodies=("left", "right")):
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_of_two_objects_equally_deep_the_first_one_wins_always(tmp_path, dtype):
+def test_the_first_of_two_equally_deep_objects_always_wins(tmp_path, dtype):
     for bodies in (("left", "right"), ("right", "left")):
         touch, scene = two_cubes(tmp_path, dtype, bodies)
         force = touch(jittered(scene, NUM_STEPS))["s"][:, 0].double()
@@ -56,7 +56,7 @@ def test_of_two_objects_equally_deep_the_first_one_wins_always(tmp_path, dtype):
         np.testing.assert_allclose(force.numpy(), np.tile(expected, (NUM_STEPS, 1)), atol=1e-4)
 
 
-def test_clearly_deeper_wins_whatever_the_order(tmp_path):
+def test_the_deeper_object_wins_whatever_the_order(tmp_path):
     touch, scene = two_cubes(tmp_path)
     scene.body_pos[0, touch.inputs.bodies.index("right"), 0] -= 1e-5
     assert touch(scene)["s"][0, 0, 1].item() == pytest.approx(2.0)
@@ -71,7 +71,7 @@ def test_quaternions_need_not_have_unit_length(tmp_path):
         torch.testing.assert_close(touch(scene)["s"], expected, rtol=1e-12, atol=1e-14)
 
 
-def test_fingers_feel_one_another(tmp_path):
+def test_fingers_feel_each_other(tmp_path):
     """An object may be a link of the robot; no link feels itself."""
     (tmp_path / "scene.xml").write_text(
         '<mujoco><worldbody><body name="thumb"><freejoint/><geom size=".01"/></body>'
@@ -100,7 +100,7 @@ def test_fingers_feel_one_another(tmp_path):
 
 @pytest.mark.parametrize("geom", HARD)
 def test_depth_follows_sizes(tmp_path, geom):
-    """Derivatives with respect to an object's sizes are those of the readings, where the nearest point is unique."""
+    """Derivatives by an object's sizes are those of the readings, where the nearest point is unique."""
     rng = np.random.default_rng(4)
     touch = module(tmp_path, rng.normal(scale=0.012, size=(20, 3)) + 0.003, geom, kind="contact_depth")
     size = touch.constants["quantities/contact_depth/geoms/0/size"].clone()

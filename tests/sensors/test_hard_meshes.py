@@ -1,4 +1,4 @@
-"""Meshes that break distance queries: no thickness, needles, faces that coincide. Readings stay finite, right and steady."""
+"""Meshes that break distance queries: no thickness, needles, coincident faces. Readings stay finite, right and steady."""
 
 import numpy as np
 import pytest
@@ -53,7 +53,7 @@ def shared_cache(tmp_path_factory, monkeypatch):
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("query", ["sdf", "raycast"])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_at_rest_the_reading_is_right_and_does_not_alternate(tmp_path, name, query, dtype):
+def test_readings_at_rest_are_right_and_steady(tmp_path, name, query, dtype):
     make, probes = CASES[name]
     touch, state = compiled(tmp_path, make(), probes, dtype, query=query, tolerance=TOLERANCE)
     readings = touch(jittered(state, NUM_STEPS))
@@ -69,8 +69,8 @@ def test_at_rest_the_reading_is_right_and_does_not_alternate(tmp_path, name, que
 
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("query", ["sdf", "raycast"])
-def test_deep_inside_and_on_the_surface_it_is_bounded(tmp_path, name, query):
-    """Probes all through the mesh, on its vertices and edges too: finite, and no deeper than its inner radius allows."""
+def test_readings_deep_inside_and_on_the_surface_are_bounded(tmp_path, name, query):
+    """Probes throughout the mesh, on its vertices and edges too: finite, and no deeper than its inner radius allows."""
     make, _ = CASES[name]
     mesh = make()
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""What a microphone hears of sources at rest and in motion, against closed forms, in a simulation."""
+"""Microphone readings of sources at rest and in motion, against closed forms, in a simulation."""
 
 import numpy as np
 import pytest
@@ -17,15 +17,15 @@ def build(tmp_path):
     return compiled
 
 
-def test_a_source_that_flies_by_is_heard_without_a_jump(build):
-    """At 30 m/s and 30 cm: successive samples of a low tone differ by no more than its slope and level allow."""
+def test_a_passing_source_is_heard_without_a_jump(build):
+    """At 30 m/s and 30 cm successive samples of a low tone differ no more than its slope and level allow."""
     touch = build(tone={"frequency": 200.0})
     samples = heard(touch, 200, source=(-3.0, 0.3, 0), speeds=(30.0, 0.0))
     assert np.abs(np.diff(samples)).max() < 1.3 * (2 * np.pi * 200.0 * 1.1 / RATE) / 0.3
 
 
-def test_blocks_of_substeps_are_those_of_single_steps(build):
-    found = []
+def test_blocks_of_substeps_equal_single_steps(build):
+    samples = []
     for substeps in (1, 4):
         touch = build(tone={"substeps": substeps})
         sim = tgdsl.simulate(touch, 1, substeps=substeps)
@@ -35,39 +35,39 @@ def test_blocks_of_substeps_are_those_of_single_steps(build):
         for _ in range(40 // substeps):
             sim.step()
             blocks.append(touch(sim.state())["mic"])
-        found.append(torch.cat(blocks[1:], dim=1)[0, :, 0, 0].numpy())
-    assert np.abs(found[0]).max() > 1
-    np.testing.assert_allclose(found[1], found[0], atol=1e-12)
+        samples.append(torch.cat(blocks[1:], dim=1)[0, :, 0, 0].numpy())
+    assert np.abs(samples[0]).max() > 1
+    np.testing.assert_allclose(samples[1], samples[0], atol=1e-12)
 
 
-def test_after_a_reset_what_was_on_its_way_is_gone(build):
+def test_a_reset_drops_sound_on_its_way(build):
     touch = build()
     sim = tgdsl.simulate(touch, 3)
     for _ in range(30):
         sim.qpos[:, 0] = 2.0
         sim.step()
-        before = touch(sim.state())["mic"]
+        previous = touch(sim.state())["mic"]
     sim.reset([1], qpos=sim.qpos[[1]])
     state = sim.state()
     after = touch(state, env_ids=[1])["mic"]
-    assert torch.equal(after[[0, 2]], before[[0, 2]]) and before.abs().amin(dim=0).max() > 0
+    assert torch.equal(after[[0, 2]], previous[[0, 2]]) and previous.abs().amin(dim=0).max() > 0
     assert (after[1] == 0).all()
     sim.step()
     after = touch(sim.state())["mic"]
     assert (after[1] == 0).all() and (after[[0, 2]].abs().amax(dim=1) > 0.1).all()
 
 
-def test_what_is_beyond_reach_is_not_heard_and_warned_of_once(build):
+def test_a_source_beyond_reach_is_silent_and_warned_about_once(build):
     touch = build({"reach": 2.0})
-    with pytest.warns(UserWarning, match=r'"mic" does not hear tone\[0\]: it was farther than `reach`, 2 m') as said:
+    with pytest.warns(UserWarning, match=r'"mic" does not hear tone\[0\]: it was farther than `reach`, 2 m') as caught:
         samples = heard(touch, 30, source=(2.5, 0, 0))
-    assert (samples == 0).all() and len(said) == 1
+    assert (samples == 0).all() and len(caught) == 1
     touch.free()
     assert np.abs(heard(touch, 30, source=(1.9, 0, 0))).max() > 0.4
 
 
-def test_a_jump_without_a_reset_is_heard_as_one_and_nothing_lasts(build):
-    """A body that is put elsewhere is faster than sound for a step: what is heard stays finite, and is right afterwards."""
+def test_a_jump_without_a_reset_has_no_lasting_effect(build):
+    """A body put elsewhere is faster than sound for a step: samples stay finite, and are right afterwards."""
     touch = build()
     sim = tgdsl.simulate(touch, 1)
     sim.qpos[0, 0] = 1.0
@@ -81,8 +81,8 @@ def test_a_jump_without_a_reset_is_heard_as_one_and_nothing_lasts(build):
 
 
 def test_single_precision_hears_the_same_for_long(build):
-    """A kilometre from the origin: samples as the float64 module has them, to what the time of a float32 clock is worth."""
-    found = [
+    """A kilometre from the origin: samples equal those of float64, within the resolution of a float32 clock."""
+    samples = [
         heard(
             build(dtype=dtype, tone={"frequency": 200.0}),
             200,
@@ -92,8 +92,8 @@ def test_single_precision_hears_the_same_for_long(build):
         )[-400:]
         for dtype in ("float64", "float32")
     ]
-    assert np.abs(found[0]).max() > 0.5
-    np.testing.assert_allclose(found[1], found[0], atol=5e-4)
+    assert np.abs(samples[0]).max() > 0.5
+    np.testing.assert_allclose(samples[1], samples[0], atol=5e-4)
 
 
 @pytest.mark.parametrize(
@@ -112,25 +112,25 @@ def test_single_precision_hears_the_same_for_long(build):
         ({"history": 3}, r"sensors\.mic\.history: this sensor reads a block of samples"),
     ],
 )
-def test_mistakes_are_located(build, mic, message):
+def test_mistakes_name_their_place(build, mic, message):
     with pytest.raises(SpecError, match=message):
         build(mic)
 
 
-def test_sources_are_of_one_rate(build):
+def test_sources_need_one_rate(build):
     other = {"kind": "tone", "links": "b", "samples": 10}
     with pytest.raises(SpecError, match=r'sensors\.mic\.hears: "other" makes 10 samples per physics step, "tone" 20'):
         build(other=other)
 
 
-def test_without_sources_there_is_nothing_to_hear(tmp_path):
+def test_a_microphone_without_sources_is_a_mistake(tmp_path):
     (tmp_path / "scene.xml").write_text(SCENE)
     sensors = {"mic": {"kind": "microphone", "pos": [0, 0, 0]}}
     with pytest.raises(SpecError, match=r"sensors\.mic: no sensor of the document makes sound"):
         tgdsl.compile({"tgdsl": 1, "robot": {"model": str(tmp_path / "scene.xml")}, "sensors": sensors})
 
 
-def test_a_chosen_microphone_brings_what_it_hears(tmp_path, build):
+def test_a_selected_microphone_brings_its_sources(tmp_path, build):
     (tmp_path / "scene.xml").write_text(SCENE)
     tones = {name: {"kind": "tone", "links": link} for name, link in (("one", "a"), ("two", "b"))}
     sensors = {"mic": {"kind": "microphone", "body": "b", "hears": ["two"]}, **tones}

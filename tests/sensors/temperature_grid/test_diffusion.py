@@ -1,4 +1,4 @@
-"""Conduction within a link: modes with insulated walls, a source at a face of a thick solid."""
+"""Conduction within a link: modes with insulated walls, and a source at a face of a thick solid."""
 
 import numpy as np
 import pytest
@@ -8,8 +8,8 @@ from oracles.setups.boxes import begin, cells_of, heat_module, heat_state
 import tgdsl
 
 
-def test_only_spectral_oversteps_a_jump(tmp_path):
-    """Half a link at 100 K above the other half: the cells' own equations never leave that range, cut-off modes do."""
+def test_only_the_spectral_scheme_overshoots_a_jump(tmp_path):
+    """Half a link at 100 K above the other half: exact equations of cells stay in that range, cut-off modes do not."""
     above = np.zeros((1, 1, 16))
     above[..., 8:] = 100.0
     beyond = {}
@@ -31,8 +31,8 @@ def test_only_spectral_oversteps_a_jump(tmp_path):
 
 
 @pytest.mark.parametrize("objects", [{}, {"ball": ([0.01, 0.01, 0.01], {"material": "steel", "temperature": 40.0})}])
-def test_a_module_that_is_saved_and_loaded_reads_the_same(tmp_path, objects):
-    """Without objects no body's pose is read; with them no field of the state says anything of their heat."""
+def test_a_saved_and_loaded_module_reads_the_same(tmp_path, objects):
+    """Without objects no body's pose is read; with them the state has no field for their heat."""
     module = heat_module(
         tmp_path, {"tip": [0.01, 0.01, 0.01]}, {"cells": [2, 2, 2], "material": "steel", "convection": 10.0}, objects
     )

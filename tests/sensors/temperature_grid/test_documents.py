@@ -1,4 +1,4 @@
-"""Documents of temperatures that the docs and the examples show: they compile, and a palm warms."""
+"""Temperature documents of the docs and the examples: they compile, and a palm warms."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ BLOCKS = [part.split("```")[0] for part in (ROOT / "docs" / "background" / "heat
 
 
 @pytest.mark.parametrize("text", BLOCKS)
-def test_what_the_docs_show_compiles(text, tmp_path):
+def test_documents_in_the_docs_compile(text, tmp_path):
     path = tmp_path / "heat.yaml"
     path.write_text(text.replace("palm_cube.xml", str(ROOT / "examples" / "palm_cube.xml")))
     touch = tgdsl.compile(path)
@@ -20,7 +20,7 @@ def test_what_the_docs_show_compiles(text, tmp_path):
 
 
 def test_a_warm_cube_warms_the_palm():
-    """What the links gain since the episode began is what the cube lost: 0.25 kg of it rests on the palm."""
+    """The links gain what the cube loses; 0.25 kg of it rests on the palm."""
     touch = tgdsl.compile(ROOT / "examples" / "warm_palm.yaml")
     sim = tgdsl.simulate(touch, 1, substeps=5, keyframe="rest")
     first = touch(sim.state())["heat/objects"]
@@ -34,15 +34,15 @@ def test_a_warm_cube_warms_the_palm():
 
 
 @pytest.mark.parametrize("sensor", [{"spacing": "0.02 mm"}, {"cells": [1500, 1000, 500]}])
-def test_too_many_cells_are_a_located_mistake(sensor, tmp_path):
-    """7.5e8 of them, in a box of 30 × 20 × 10 mm."""
+def test_too_many_cells_are_a_mistake(sensor, tmp_path):
+    """7.5e8 cells, in a box of 30 × 20 × 10 mm."""
     (field,) = sensor
     message = rf"sensors\.heat\.{field}: its links have 7\.5e\+08 cells, expected at most 1,000,000"
     with pytest.raises(tgdsl.SpecError, match=message):
         heat_module(tmp_path, {"a": [0.03, 0.02, 0.01]}, {"material": "copper", **sensor})
 
 
-def test_a_link_that_is_a_plane_is_a_located_mistake(tmp_path):
+def test_a_link_that_is_a_plane_is_a_mistake(tmp_path):
     (tmp_path / "floor.xml").write_text(
         '<mujoco><worldbody><body name="floor"><geom type="plane" size="1 1 .1"/></body></worldbody></mujoco>'
     )
@@ -53,8 +53,8 @@ def test_a_link_that_is_a_plane_is_a_located_mistake(tmp_path):
         tgdsl.compile(tmp_path / "heat.yaml")
 
 
-def test_an_object_that_encloses_nothing_is_a_located_mistake(tmp_path):
-    """Of an open mesh whose faces do not agree which side is out only rounding is left as volume: it held 4e-16 J."""
+def test_an_object_that_encloses_nothing_is_a_mistake(tmp_path):
+    """An open mesh with inconsistent faces has only rounding errors as its volume: it held 4e-16 J."""
     (tmp_path / "shell.xml").write_text(
         '<mujoco><asset><mesh name="shell" inertia="shell" vertex="0 0 0 .02 0 0 0 .02 0 0 0 .02" face="0 1 2 0 1 3"/></asset>'
         '<worldbody><body name="tip"><freejoint/><geom type="box" size=".01 .01 .01"/></body>'
@@ -75,7 +75,7 @@ def test_an_object_that_encloses_nothing_is_a_located_mistake(tmp_path):
 
 
 def test_an_area_by_hertz_needs_a_stiffness(tmp_path):
-    """Without one of both sides a point contact had no area, and passed no heat."""
+    """If neither side had a stiffness, a point contact would have no area and pass no heat."""
     material = {"conductivity": 200.0, "density": 2700.0, "specific_heat": 900.0, "emissivity": 0.1}
     ball = {"ball": ([0.02] * 3, {"material": material, "temperature": 45.0})}
     with pytest.raises(tgdsl.SpecError, match=r"objects\.ball\.material: neither .* has a `youngs_modulus`.*`contact_area`"):
@@ -83,7 +83,7 @@ def test_an_area_by_hertz_needs_a_stiffness(tmp_path):
     heat_module(tmp_path, {"tip": [0.01] * 3}, {"cells": [1, 1, 1], "material": material, "contact_area": "1 mm2"}, ball)
 
 
-def test_rows_of_one_number_of_each_link_name_links(tmp_path):
+def test_rows_of_one_number_per_link_name_links(tmp_path):
     for outputs in ("cells", "max", "mean"):
         module = heat_module(
             tmp_path, {"a": [0.01] * 3, "b": [0.02] * 3}, {"material": "steel", "cells": [1, 1, 1], "outputs": outputs}

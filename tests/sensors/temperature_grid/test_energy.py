@@ -1,4 +1,4 @@
-"""Energy: what is stored follows from what came in and went out, in float32 too, with contacts that come and go."""
+"""Energy: stored heat follows from inflow and outflow, in float32 too, with contacts that come and go."""
 
 import numpy as np
 import pytest
@@ -17,9 +17,9 @@ ALL = {"source": {"power": 1.5}, "emissivity": "material", "convection": 12.0, "
 
 
 def module_of(tmp_path, terms, dtype, **sensor):
-    said = {name: value for name, value in ALL.items() if name in terms and name != "feels"}
-    objects = {name: (sides, said) for name, (sides, said) in OBJECTS.items() if name != "other"}
-    parameters = {"cells": [2, 3, 2], "material": "steel", "temperature": 60.0, "lag": 0.1, **said, **sensor}
+    fields = {name: value for name, value in ALL.items() if name in terms and name != "feels"}
+    objects = {name: (sides, fields) for name, (sides, fields) in OBJECTS.items() if name != "other"}
+    parameters = {"cells": [2, 3, 2], "material": "steel", "temperature": 60.0, "lag": 0.1, **fields, **sensor}
     if "feels" not in terms:
         return heat_module(tmp_path, LINKS, parameters, dtype=dtype)
     return heat_module(tmp_path, LINKS, parameters, {**objects, "other": (None, OBJECTS["other"][1])}, dtype)
@@ -47,7 +47,7 @@ def states_of(module, num_envs, count, seed=0):
 
 
 class Account:
-    """What comes in and goes out, in float64, and what is stored."""
+    """Inflow and exchanged heat, in float64."""
 
     def __init__(self):
         self.inflow, self.exchanged = 0.0, 0.0
@@ -62,12 +62,12 @@ class Account:
 
 
 def heat_capacity(material, sides):
-    own = MATERIALS[material]
-    return own.density * own.specific_heat * float(np.prod(sides))
+    properties = MATERIALS[material]
+    return properties.density * properties.specific_heat * float(np.prod(sides))
 
 
-def stored(module):
-    """Return what links and objects hold above ambient (env,) [J], from what the module remembers, in float64."""
+def stored_heat(module):
+    """Return the heat of links and objects above ambient (env,) [J], from the module's memory, in float64."""
     parts = {name: module.memory.get_buffer(f"heat:{name}") for name in module.plan.sensors[0].state}
     cells = (parts["cells"].double() + parts["cells_low"].double()).mean(dim=(2, 3, 4))
     total = sum(cells[:, i] * heat_capacity("steel", sides) for i, sides in enumerate(LINKS.values()))
@@ -79,15 +79,15 @@ def stored(module):
 
 
 def imbalance(module, states, num_steps):
-    """Return the largest error of the balance over the heat exchanged, of all environments."""
+    """Return the largest error of the balance, relative to the heat exchanged, of all environments."""
     account = Account()
     module(states[0])
-    begin = stored(module)
+    begin = stored_heat(module)
     with torch.no_grad():
         for step in range(num_steps):
             readings = module(states[step % len(states)])
             account.add(readings)
-    error = (stored(module) - begin - account.inflow).abs()
+    error = (stored_heat(module) - begin - account.inflow).abs()
     assert (account.exchanged > 0).all()
     return float((error / account.exchanged).max())
 
@@ -95,7 +95,7 @@ def imbalance(module, states, num_steps):
 @pytest.mark.parametrize("terms", [*((term,) for term in ALL), tuple(ALL)], ids="-".join)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-11)])
 def test_energy_is_conserved(tmp_path, terms, dtype, tolerance):
-    """Of each term alone and of all together."""
+    """For each term alone and for all together."""
     module = module_of(tmp_path, terms, dtype)
     assert imbalance(module, states_of(module, 4, 7), 28) < tolerance
 
@@ -106,15 +106,15 @@ def test_energy_is_conserved_by_all_schemes(tmp_path, scheme):
     assert imbalance(module, states_of(module, 4, 7), 28) < 1e-5
 
 
-def test_without_a_way_out_energy_stays(tmp_path):
-    """Of conduction and contact alone nothing is left or made: to the resolution of what is stored."""
+def test_energy_stays_without_losses(tmp_path):
+    """Conduction and contact alone neither lose nor create heat, to the resolution of the stored values."""
     module = module_of(tmp_path, ("feels",), torch.float64)
     states = states_of(module, 8, 9)
     module(states[0])
-    begin = stored(module)
+    begin = stored_heat(module)
     for state in states * 10:
         readings = module(state)
-    torch.testing.assert_close(stored(module), begin, rtol=1e-13, atol=0)
+    torch.testing.assert_close(stored_heat(module), begin, rtol=1e-13, atol=0)
     torch.testing.assert_close(
         readings["heat/heat"][..., 0].sum(dim=1) + readings["heat/objects"][..., 1].sum(dim=1), begin, rtol=1e-12, atol=0
     )

@@ -14,27 +14,27 @@ from tgdsl.sensors.temperature_grid.spec import lost_error
 
 
 def test_a_hot_block_stays_hot_for_a_second():
-    """Of 2 × 3 × 4 cm at 100 °C: physics takes 51 mK of it in a second; the paper's implementation leaves it at −19.6 °C."""
+    """A block of 2 × 3 × 4 cm at 100 °C loses 51 mK in a second; the paper's implementation leaves it at −19.6 °C."""
     assert cooling.hot_block().exact[0] == pytest.approx(0.0506, rel=0.01)
     assert cooling.hot_block().paper_error > 100
 
 
 def test_after_a_reset_a_slow_element_reads_the_truth(tmp_path):
-    """Of the environments that were reset alone."""
+    """Only in the environments that were reset."""
     parameters = {"cells": [1, 2, 1], "material": "aluminium", "temperature": 60.0, "convection": 900.0, "lag": "2 s"}
     module = heat_module(tmp_path, {"block": SIDES}, parameters, dtype=torch.float32)
     state = heat_state(module, 0.5, num_envs=3)
     for _ in range(5):
-        before = module(state)["heat"].clone()
-    assert (before < 59.0).all()
+        previous = module(state)["heat"].clone()
+    assert (previous < 59.0).all()
     module.reset([1])
     after = module(state)["heat"]
     assert (after[1] == 60.0).all()
-    assert (after[[0, 2]] < before[[0, 2]]).all()
+    assert (after[[0, 2]] < previous[[0, 2]]).all()
 
 
-def test_cells_that_are_too_large_for_their_losses_are_named(tmp_path):
-    """Once, with the cells that would do; the module's own error is the one that is named."""
+def test_cells_too_large_for_their_losses_cause_a_warning(tmp_path):
+    """Once, with the number of cells that suffices; the stated error is the module's."""
     document = {
         "tgdsl": 1,
         "robot": {"model": str(tmp_path / "boxes.xml")},
@@ -52,8 +52,8 @@ def test_cells_that_are_too_large_for_their_losses_are_named(tmp_path):
 
 
 @pytest.mark.parametrize("exposed", [("-x", "+x", "-y", "+y", "-z", "+z"), ("+z",), ("-x", "+y", "-y")])
-def test_the_error_of_losses_is_that_of_the_module(exposed):
-    """Of a block of rubber, against products of slabs' series."""
+def test_the_estimated_error_of_losses_is_the_modules(exposed):
+    """A block of rubber, against products of slabs' series."""
     count, size, rubber = np.array([2, 3, 1]), np.array([0.02, 0.03, 0.01]), MATERIALS["rubber"]
     ends = {name: sum(face[1] == name for face in exposed) for name in "xyz"}
     lengths = {name: size["xyz".index(name)] / number for name, number in ends.items() if number}
@@ -69,23 +69,23 @@ def test_the_error_of_losses_is_that_of_the_module(exposed):
 
 
 def test_cells_lose_nothing_beyond_the_box(tmp_path):
-    """Of links with fewer cells than another there are none in the rows' padding; what faces lose is what the cells lost."""
+    """Links with fewer cells than another hold no heat in the rows' padding; what faces lose is what the cells lost."""
     sensor = {"spacing": "4 mm", "material": "skin", "temperature": 60.0, "convection": 30.0, "emissivity": 0.8}
     module = heat_module(tmp_path, {"a": [0.012, 0.008, 0.004], "b": [0.008, 0.016, 0.012]}, sensor)
     state, lost = heat_state(module, 2.0), 0.0
-    begun = module(state)["heat/heat"][0, :, 0].clone()
+    initial = module(state)["heat/heat"][0, :, 0].clone()
     for _ in range(20):
         heat = module(state)["heat/heat"][0]
         lost = lost + heat[:, 2:4].sum(dim=1)
     cells = cells_of(module)[0]
     assert (cells[0, :, 2:] == 0).all() and (cells[0, :, :, 1:] == 0).all() and (cells[1, 2:] == 0).all()
     assert (lost < -1.0).all()
-    torch.testing.assert_close(heat[:, 0] - begun, lost, rtol=1e-12, atol=0)
+    torch.testing.assert_close(heat[:, 0] - initial, lost, rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("sides", [(0.02, 0.02, 0.02), (0.04, 0.02, 0.01)])
-def test_an_object_of_one_temperature_cools_as_one_cell(tmp_path, sides):
-    """Half a cube of its volume stands between what it holds and the air, as one cell of such a cube."""
+def test_an_object_of_one_temperature_cools_like_one_cell(tmp_path, sides):
+    """Half a cube of its volume lies between its heat and the air, as for one cell of such a cube."""
     width = float(np.prod(sides)) ** (1 / 3)
     area = 2 * (sides[0] * sides[1] + sides[1] * sides[2] + sides[2] * sides[0])
     rubber = MATERIALS["rubber"]
@@ -93,6 +93,6 @@ def test_an_object_of_one_temperature_cools_as_one_cell(tmp_path, sides):
     module = heat_module(tmp_path, {"tip": [0.01] * 3}, sensor, {"ball": (sides, {"material": "rubber", "temperature": 62.0})})
     state = heat_state(module, 10.0)
     for _ in range(31):
-        found = module(state)["heat/objects"][0, 0, 0].item() - 22.0
+        temperature = module(state)["heat/objects"][0, 0, 0].item() - 22.0
     rate = area / (1 / 15.0 + width / (6 * rubber.conductivity)) / (rubber.density * rubber.specific_heat * width**3)
-    assert found == pytest.approx(40.0 * np.exp(-rate * 300.0), rel=1e-9)
+    assert temperature == pytest.approx(40.0 * np.exp(-rate * 300.0), rel=1e-9)
