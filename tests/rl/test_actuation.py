@@ -380,8 +380,8 @@ def test_drives_that_begin_at_controls_press_from_the_first_step(tmp_path, simul
     for drive in (None, DriveSpec(backlash=(0.02, 0.02))):
         sim, actuation = hinge(tmp_path, simulator, num_envs=2, action=ActionSpec(), drive=drive)
         sim.reset(ctrl=[0.1])
-        chosen = torch.tensor([True, False])
-        begin(actuation, chosen, torch.ones(2, dtype=torch.int64), at_controls=True)
+        is_begun = torch.tensor([True, False])
+        begin(actuation, is_begun, torch.ones(2, dtype=torch.int64), at_controls=True)
         torch.testing.assert_close(actuation.target[:, 0], torch.tensor([0.1, 0.0]).to(actuation.target))
         actuation.command(torch.zeros(2, 1))
         sim.step()

@@ -90,8 +90,8 @@ def test_a_curriculums_number_acts_as_if_set_in_the_document(tmp_path, name):
         action = 2 * torch.rand((4, env.num_actions), generator=generator) - 1
         one, two = env.step(action), other.step(action)
         assert torch.equal(one.reward, two.reward) and torch.equal(one.terminated, two.terminated)
-        for mine, theirs in ((one.obs, two.obs), (one.info.terms, two.info.terms)):
-            assert all(torch.equal(value, theirs[key]) for key, value in mine.items())
+        for actual, expected in ((one.obs, two.obs), (one.info.terms, two.info.terms)):
+            assert all(torch.equal(value, expected[key]) for key, value in actual.items())
 
 
 def test_one_document_can_have_stages_of_a_number(tmp_path):

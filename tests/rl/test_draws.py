@@ -59,7 +59,7 @@ def test_numbers_do_not_depend_on_batch_order_or_amount():
     assert torch.equal(late.uniform("x", torch.arange(8), 2), numbers[:, :2])
 
 
-def hashed_number(seed: int, what: str, env: int, count: int, index: int) -> float:
+def hashed_number(seed: int, purpose: str, env: int, count: int, index: int) -> float:
     """Return the number in (0, 1) that the definition gives, in Python's integers."""
     mask = 2**32 - 1
 
@@ -70,7 +70,7 @@ def hashed_number(seed: int, what: str, env: int, count: int, index: int) -> flo
 
     first, second = (
         mix(mix(mix((env ^ key) & mask) ^ (count & mask)) ^ mix(count >> 32))
-        for key in (k & mask for k in sensor_key(seed, what))
+        for key in (k & mask for k in sensor_key(seed, purpose))
     )
     word = mix(index ^ first) ^ second
     return ((word >> (32 - UNIFORM_BITS)) + 0.5) / 2**UNIFORM_BITS

@@ -137,10 +137,10 @@ def test_final_obs_holds_the_last_observations(make):
     other = make(3)
     env.reset(), other.reset()
     for action in actions(env, 4):
-        made, longer = env.step(action), other.step(action)
-    assert made.truncated.all() and not longer.truncated.any()
-    assert same(made.info.final_obs, longer.obs)
-    assert not torch.equal(made.obs["proprio"], longer.obs["proprio"])
+        result, longer = env.step(action), other.step(action)
+    assert result.truncated.all() and not longer.truncated.any()
+    assert same(result.info.final_obs, longer.obs)
+    assert not torch.equal(result.obs["proprio"], longer.obs["proprio"])
     assert same(longer.info.final_obs, longer.obs)
 
 
@@ -149,13 +149,13 @@ def test_resetting_one_environment_leaves_the_others_unchanged(make, more):
     """Noise, history and draws of the other environments stay identical to the bit."""
     one, other = make(more=more), make(more=more)
     assert same(one.reset(3), other.reset(3))
-    others = [0, 2, 3]
+    unreset = [0, 2, 3]
     for i, action in enumerate(actions(one, STEPS)):
         if i in (2, 3, 7):
             other.steps[1] = other.max_steps - 1
-        made, other_result = one.step(action), other.step(action)
+        result, other_result = one.step(action), other.step(action)
         assert other_result.truncated.tolist() == [False, i in (2, 3, 7), False, False]
-        assert same(made.obs, other_result.obs, others) and torch.equal(made.reward[others], other_result.reward[others])
+        assert same(result.obs, other_result.obs, unreset) and torch.equal(result.reward[unreset], other_result.reward[unreset])
 
 
 def test_noise_advances_once_per_control_step(make):

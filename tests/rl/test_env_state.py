@@ -65,9 +65,9 @@ def test_readings_are_available_one_step_after_loading_a_state(make):
 @pytest.mark.parametrize("is_begun", [False, True])
 def test_a_refused_state_changes_nothing(make, is_begun):
     env, other = make(more=NOISY + RANDOM, seed=1), make(more=NOISY + RANDOM, seed=9)
-    for each in (env, other) if is_begun else (env,):
-        each.step(torch.ones(4, 2))
-    saved, before = env.state_dict(), other.state_dict()
+    for environment in (env, other) if is_begun else (env,):
+        environment.step(torch.ones(4, 2))
+    saved, old_state = env.state_dict(), other.state_dict()
     cases = [({name: value for name, value in saved.items() if name != part}, part) for part in saved if part != "sim"]
     cases += [
         ({name: value for name, value in saved.items() if name != "sim"}, "the state of another simulation: state/time"),
@@ -81,8 +81,8 @@ def test_a_refused_state_changes_nothing(make, is_begun):
     for state, match in cases:
         with pytest.raises(SimulationError, match=match):
             other.load_state_dict(state)
-    after = other.state_dict()
-    assert after.keys() == before.keys()
-    for part, value in before.items():
-        assert value.keys() == after[part].keys() and all(torch.equal(value[name], after[part][name]) for name in value)
+    new_state = other.state_dict()
+    assert new_state.keys() == old_state.keys()
+    for part, value in old_state.items():
+        assert value.keys() == new_state[part].keys() and all(torch.equal(value[name], new_state[part][name]) for name in value)
     other.step(torch.ones(4, 2))

@@ -91,9 +91,9 @@ def test_terms_add_to_reward_termination_and_observations(folder):
     for _ in range(20):
         action = 2 * torch.rand((4, 2), generator=rng) - 1
         action[0] = 1.0  # the first environment's joints go up until the episode ends
-        made, other = env.step(action), plain.step(action)
-        if (ended | made.info.ended).any():
-            ended |= made.terminated
+        result, other = env.step(action), plain.step(action)
+        if (ended | result.info.ended).any():
+            ended |= result.terminated
             break
         pos, speed, spin = (env.now.object.pos, env.now.object.linvel.norm(dim=1), env.now.object.angvel.norm(dim=1))
         expected = {
@@ -101,10 +101,10 @@ def test_terms_add_to_reward_termination_and_observations(folder):
             "hurry": -0.5 * ((speed / 1e-3 - 1).clamp(min=0) + (spin / 0.01 - 1).clamp(min=0)),
         }
         for name, rate in expected.items():
-            np.testing.assert_allclose(made.info.terms[name], env.control_step * rate, rtol=1e-5, atol=1e-9)
-        extra = sum(made.info.terms[name] for name in expected)
-        np.testing.assert_allclose(made.reward - other.reward, extra, rtol=1e-4, atol=1e-6)
-        np.testing.assert_allclose(made.obs["squares"], env.now.joint_pos.square(), rtol=1e-6)
+            np.testing.assert_allclose(result.info.terms[name], env.control_step * rate, rtol=1e-5, atol=1e-9)
+        extra = sum(result.info.terms[name] for name in expected)
+        np.testing.assert_allclose(result.reward - other.reward, extra, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(result.obs["squares"], env.now.joint_pos.square(), rtol=1e-6)
     assert ended[0]
 
 
@@ -178,13 +178,13 @@ def test_a_term_cannot_replace_one_of_the_task(folder):
 def test_a_document_can_remove_a_term_of_the_task(folder):
     """Its name becomes free, and the other terms stay the same."""
     env, plain = tiny_env(folder, overrides={"rewards.near": "null"}), tiny_env(folder)
-    made, other = env.step(torch.full((4, 2), 0.3)), plain.step(torch.full((4, 2), 0.3))
-    assert made.info.terms.keys() == other.info.terms.keys() - {"near"}
-    assert torch.allclose(made.reward, other.reward - other.info.terms["near"], rtol=1e-6, atol=1e-7)
+    result, other = env.step(torch.full((4, 2), 0.3)), plain.step(torch.full((4, 2), 0.3))
+    assert result.info.terms.keys() == other.info.terms.keys() - {"near"}
+    assert torch.allclose(result.reward, other.reward - other.info.terms["near"], rtol=1e-6, atol=1e-7)
     env = tiny_env(folder, more="rewards: {near: null}\nterms: {near: {weight: 2, width: 1 cm}}\n")
-    made = env.step(torch.full((4, 2), 0.3))
+    result = env.step(torch.full((4, 2), 0.3))
     rate = np.exp(-np.maximum(env.now.distance.numpy(), 0.0) / 0.01).mean(axis=1)
-    np.testing.assert_allclose(made.info.terms["near"], 2 * env.control_step * rate, rtol=1e-6)
+    np.testing.assert_allclose(result.info.terms["near"], 2 * env.control_step * rate, rtol=1e-6)
 
 
 def test_a_user_defined_task_lists_its_terms(folder):

@@ -62,14 +62,14 @@ class Row(gymnasium.Env):
 
     def step(self, action):
         self.index += 1
-        made, row = self.truth.steps[self.index], self.env
-        info = made.info
+        result, row = self.truth.steps[self.index], self.env
+        info = result.info
         step_info = {"terms": {name: value[row].numpy()[()] for name, value in info.terms.items()}}
         step_info |= {"episode_terms": {name: value[row].numpy()[()] for name, value in info.episode_terms.items()}}
         step_info |= {name: getattr(info, name)[row].numpy()[()] for name in ("score", "episode_return", "episode_steps")}
         step_info["faults"] = bool(info.faults[row])
         obs = {name: value[row].numpy() for name, value in info.final_obs.items()}
-        return obs, float(made.reward[row]), bool(made.terminated[row]), bool(made.truncated[row]), step_info
+        return obs, float(result.reward[row]), bool(result.terminated[row]), bool(result.truncated[row]), step_info
 
 
 def assert_same(actual, expected, where=""):
@@ -215,13 +215,13 @@ def test_infos_can_be_a_list(touch_env, truth, actions):
     env = vector.DictInfoToList(TouchVectorEnv(touch_env))
     assert env.reset(seed=7)[1] == [{}] * NUM_ENVS
     stagger(touch_env)
-    for action, made in zip(actions, truth.steps, strict=True):
+    for action, result in zip(actions, truth.steps, strict=True):
         for row, info in enumerate(env.step(action)[4]):
-            ended = bool(made.info.ended[row])
+            ended = bool(result.info.ended[row])
             assert set(info) == ({"final_obs", "final_info"} if ended else set(STEP_KEYS))
             episode_info = info["final_info"] if ended else info
-            assert episode_info["terms"]["tilt"] == made.info.terms["tilt"][row]
-            assert episode_info["episode_steps"] == made.info.episode_steps[row]
+            assert episode_info["terms"]["tilt"] == result.info.terms["tilt"][row]
+            assert episode_info["episode_steps"] == result.info.episode_steps[row]
 
 
 @pytest.mark.parametrize("wrapper", [vector.FlattenObservation, vector.NormalizeObservation])

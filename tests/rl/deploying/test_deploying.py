@@ -83,11 +83,11 @@ def test_following_set_points_equals_stepping_with_actions(task):
             if follows:
                 control = env.sim.ctrl.clone()
                 control[:, torch.from_numpy(env.task.setup.actuators.actuator)] = targets[i]
-                made = env.follow(control)
+                result = env.follow(control)
             else:
-                made = env.step(action)
+                result = env.step(action)
                 targets.append(env.actuation.target.clone())
-            states.append((env.sim.qpos.clone(), made.obs["tactile_sensors"].clone(), made.info.score.clone()))
+            states.append((env.sim.qpos.clone(), result.obs["tactile_sensors"].clone(), result.info.score.clone()))
         runs.append(states)
         env.close()
     for state, other_state in zip(*runs, strict=True):

@@ -314,12 +314,12 @@ def test_metrics_of_an_iteration_are_per_block(make):
 def test_evaluating_blocks_equals_evaluating_one_policy(make):
     """A block's scores and returns equal those of one policy in the same environments."""
     distiller = make(types=("none",), placements=("ends",), seeds=2, num_envs=6)
-    each = evaluate_each(distiller.env, distiller.acting(), 2, 6, seed=5)
-    assert [(block.episodes, block.envs) for block in each] == [(6, 3), (6, 3)]
+    blocks = evaluate_each(distiller.env, distiller.acting(), 2, 6, seed=5)
+    assert [(evaluation.episodes, evaluation.envs) for evaluation in blocks] == [(6, 3), (6, 3)]
     whole = evaluate(distiller.env, distiller.acting(), 12, seed=5)
-    assert whole.score == pytest.approx(sum(block.score for block in each) / 2)
-    assert whole.episode_return == pytest.approx(sum(block.episode_return for block in each) / 2)
-    assert each[0].episode_return != each[1].episode_return
+    assert whole.score == pytest.approx(sum(evaluation.score for evaluation in blocks) / 2)
+    assert whole.episode_return == pytest.approx(sum(evaluation.episode_return for evaluation in blocks) / 2)
+    assert blocks[0].episode_return != blocks[1].episode_return
 
 
 def test_a_teacher_may_use_touch(make, tmp_path):

@@ -56,16 +56,16 @@ def test_streams_and_graphs_change_nothing(distillers):
             distiller.set_rate(number / 5)
         captured.roll()
         eager.go_on()
-        for value, its in zip(eager._of_rollout(), captured._of_rollout(), strict=True):
-            value.copy_(its)
+        for value, source in zip(eager._of_rollout(), captured._of_rollout(), strict=True):
+            value.copy_(source)
         for distiller in distillers:
             distiller.learn()
         torch.testing.assert_close(captured._losses, eager._losses, rtol=1e-4, atol=1e-6)
-        for own, its in zip(captured.rollouts, eager.rollouts, strict=True):
-            for name, value in own.stack.parameters.items():
-                torch.testing.assert_close(value, its.stack.parameters[name], rtol=1e-3, atol=1e-4)
-            for name, value in own.stack.moments.items():
-                torch.testing.assert_close(value, its.stack.moments[name], rtol=1e-9, atol=1e-12)
+        for rollout, source in zip(captured.rollouts, eager.rollouts, strict=True):
+            for name, value in rollout.stack.parameters.items():
+                torch.testing.assert_close(value, source.stack.parameters[name], rtol=1e-3, atol=1e-4)
+            for name, value in rollout.stack.moments.items():
+                torch.testing.assert_close(value, source.stack.moments[name], rtol=1e-9, atol=1e-12)
     assert captured._learned._graph is not None and eager._learned._graph is None
 
 

@@ -40,7 +40,7 @@ def env():
     environments.close()
 
 
-def still(env):
+def zero_actions(env):
     return torch.zeros(env.num_envs, env.num_actions)
 
 
@@ -93,9 +93,9 @@ def test_rewards_ends_and_scores_equal_the_reference():
     for i, action in enumerate(random_actions(env, 60)):
         recorder.step(torch.ones_like(action) if i % 30 > 20 else action)
     assert sum(len(episodes) for episodes in recorder.episodes) > 2 * NUM
-    seen = assert_reference(recorder, reference_of)
+    names = assert_reference(recorder, reference_of)
     # Joints stay far from the ends of their ranges.
-    assert seen == {*GripForce.Rewards.model_fields, "is_over", "score"} - {"joint_limit"}
+    assert names == {*GripForce.Rewards.model_fields, "is_over", "score"} - {"joint_limit"}
     env.close()
 
 
@@ -152,7 +152,7 @@ def regulated_steps(env, force, steps):
     share = force / env.task.command
     for _ in range(steps):
         press(env, share)
-        result = env.step(still(env))
+        result = env.step(zero_actions(env))
         yield result
         share = share + 0.2 * (force - force_of(result)) / env.task.command
 
@@ -175,7 +175,7 @@ def test_force_taxels_carry_the_weight():
     """At rest the taxels of thumb and fingers carry the weight to 1 %, so no contact force is missed."""
     env = grip(touch="force_taxel", resolution="low", force=["7 N", "7 N"], randomise__friction=[1.5, 1.5])
     for _ in range(20):
-        env.step(still(env))
+        env.step(zero_actions(env))
     load = env._sensed.felt
     readings, taxels = env.now.readings[load].double(), env.touch.taxels[load]
     bodies = list(dict.fromkeys(taxels["link"]))
@@ -205,7 +205,7 @@ def test_groups_of_observations(env):
     torch.testing.assert_close(obs["goal"][:, 0].double(), env.task.command, rtol=1e-6, atol=0)
     torch.testing.assert_close(obs["priv_obj_props"][:, 1].double(), env.task.setup.mass, rtol=1e-6, atol=0)
     assert not obs["priv_force"].any()  # contacts are not evaluated after a reset
-    result = env.step(still(env))
+    result = env.step(zero_actions(env))
     normal_forces = result.obs["priv_force"]
     torch.testing.assert_close(normal_forces[:, 0], normal_forces[:, 1:].sum(dim=1))
     touching_links = [name for name, forces in zip(env.task.setup.links, normal_forces[:, 1:].T, strict=True) if forces.any()]
@@ -220,10 +220,10 @@ def test_commands_suffice_to_hold_the_object(env):
     shares, lows = [], []
     for seed in range(40):
         env.reset(seed)
-        command, mass, friction = env.task.command, env.task.setup.mass, env.task.setup.friction
+        commands, mass, friction = env.task.command, env.task.setup.mass, env.task.setup.friction
         low = (1.5 * mass * GRAVITY / friction).clamp(min=1.0)
-        assert (command >= low).all() and (command <= 8).all() and low.max() < 7.4
-        shares.append((command - low) / (8 - low))
+        assert (commands >= low).all() and (commands <= 8).all() and low.max() < 7.4
+        shares.append((commands - low) / (8 - low))
         lows.append(low)
     share = torch.cat(shares).sort().values
     assert (torch.cat(lows) == 1).any()
@@ -240,7 +240,7 @@ def test_commands_change_at_random_times(env, monkeypatch):
     ages, changes = [], []
     for _ in range(60):
         observed, score = obs["goal"][:, 0], env.task.squares.clone()
-        result = env.step(still(env))
+        result = env.step(zero_actions(env))
         obs = result.obs
         assert not result.info.ended.any()
         error = force_of(result) / observed.double() - 1
@@ -258,7 +258,7 @@ def test_commands_change_at_random_times(env, monkeypatch):
 
 def test_the_score_before_forces_settle_is_that_of_no_force(env):
     env.reset(0)
-    scores = [env.step(still(env)).info.score for _ in range(40)]
+    scores = [env.step(zero_actions(env)).info.score for _ in range(40)]
     assert all((score == 1).all() for score in scores[:39])  # the fortieth step is one second after the start
     assert (scores[39] < 0.5).all()
 
@@ -266,7 +266,7 @@ def test_the_score_before_forces_settle_is_that_of_no_force(env):
 def test_a_falling_object_ends_as_a_drop(env):
     env.reset(0)
     env.sim.qpos[2, 14] -= 0.05
-    result = env.step(still(env))
+    result = env.step(zero_actions(env))
     assert result.terminated.tolist() == [i == 2 for i in range(NUM)] and not result.truncated.any()
     assert result.info.terms["drop"][2].item() == pytest.approx(-100 * env.control_step)
     assert not result.info.terms["crush"].any()
@@ -276,7 +276,7 @@ def test_an_object_pressed_too_hard_ends_as_crushed(env):
     env.reset(0)
     press(env, torch.where(torch.arange(NUM) == 4, 25.0 / env.task.command, 1.0))
     for _ in range(12):
-        result = env.step(still(env))
+        result = env.step(zero_actions(env))
         assert torch.equal(result.terminated, force_of(result) > 15)
         if result.terminated.any():
             break
@@ -339,7 +339,7 @@ def test_every_object_is_held_for_ten_seconds_without_actions():
     commands, forces = env.task.command.clone(), []
     start = env.task.start_pos.clone()
     for i in range(env.max_steps):
-        result = env.step(still(env))
+        result = env.step(zero_actions(env))
         assert not result.terminated.any()
         forces += [force_of(result)] if i > 40 else []
     force = torch.stack(forces).mean(dim=0)
@@ -389,7 +389,7 @@ def test_mujoco_warp_agrees():
         env = TouchEnv(DOCUMENT, NUM, overrides=PLAIN, simulator=simulator)
         obs = env.reset(1)
         for _ in range(20):
-            result = env.step(still(env))
+            result = env.step(zero_actions(env))
             assert not result.info.ended.any()
         forces.append((obs["goal"].cpu(), force_of(result).cpu()))
         env.close()

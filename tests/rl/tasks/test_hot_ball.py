@@ -38,7 +38,7 @@ def env():
     bins.close()
 
 
-def still(env):
+def zero_actions(env):
     return torch.zeros(env.num_envs, env.num_actions)
 
 
@@ -69,7 +69,7 @@ def rolled(env):
     """Return positions after the balls have rolled to the wall, from seed 0."""
     env.reset(0)
     for _ in range(30):
-        env.step(still(env))
+        env.step(zero_actions(env))
     return env.sim.qpos.clone()
 
 
@@ -136,7 +136,7 @@ def test_only_the_hot_ball_latches(env, rolled, monkeypatch, margin, steps, leas
     press_on(env, rolled, [0, 3])
     latched_at, seconds = torch.full((2,), torch.inf), 0.0
     for _ in range(steps):
-        result = env.step(still(env))
+        result = env.step(zero_actions(env))
         seconds += env.control_step
         latched_at = torch.where(env.task.is_latched & latched_at.isinf(), seconds, latched_at)
     assert least < latched_at[0] < most and latched_at[1].isinf()
@@ -159,7 +159,7 @@ def test_rubber_fingers_never_latch(tmp_path, rolled):
     env = bin_of_balls(1, document=str(tmp_path / "rubber.yaml"))
     press_on(env, rolled, [0])
     for _ in range(40):
-        result = env.step(still(env))
+        result = env.step(zero_actions(env))
     assert env.task.is_touched.all() and not env.task.is_latched.any()
     assert (hottest(env) > 22.001).all() and (hottest(env) < 23.0).all() and (result.info.score == 0).all()
     env.close()
@@ -216,7 +216,7 @@ def test_approaching_the_hot_ball_beats_rest_and_rest_beats_leaving(env):
         env.reset(3)
         total = torch.zeros(2)
         for _ in range(20):
-            action, towards = still(env), ball_positions(env)[:, 0, :2].float()  # fingertips are above the middle
+            action, towards = zero_actions(env), ball_positions(env)[:, 0, :2].float()  # fingertips are above the middle
             action[:, :2] = 0.3 * direction * towards / towards.norm(dim=1, keepdim=True)
             total += env.step(action).reward
         rewards[direction] = total
@@ -226,7 +226,7 @@ def test_approaching_the_hot_ball_beats_rest_and_rest_beats_leaving(env):
 def test_groups_of_observations(env, rolled):
     press_on(env, rolled, [0, 3])
     for _ in range(40):
-        result = env.step(still(env))
+        result = env.step(zero_actions(env))
     heat = env.now.readings["heat"][:, :, 0]
     assert result.obs["tactile_sensors"].shape == (2, 10 * 8)
     torch.testing.assert_close(result.obs["tactile_sensors"], heat.float())
@@ -236,7 +236,7 @@ def test_groups_of_observations(env, rolled):
     assert progress[0].amax() > 0.2 and (progress[1] < 1e-5).all()
     torch.testing.assert_close(result.obs["priv_heat"][:, :10], progress.float())
     assert result.obs["priv_heat"][:, 10:].tolist() == [[0, 1], [0, 0]]
-    joints = torch.cat([env.sim.qpos[:, :15], env.sim.qvel[:, :15], still(env)], dim=1)
+    joints = torch.cat([env.sim.qpos[:, :15], env.sim.qvel[:, :15], zero_actions(env)], dim=1)
     torch.testing.assert_close(result.obs["proprio"], joints.float(), rtol=0, atol=1e-2)  # a physics step earlier
     torch.testing.assert_close(result.obs["priv_obj_state"][:, :3], ball_positions(env)[:, 0].float(), rtol=0, atol=1e-4)
     assert env.groups == {"proprio": 45, "tactile_sensors": 80, "priv_proprio": 60, "priv_heat": 12, "priv_obj_state": 15,
@@ -281,7 +281,7 @@ def test_balls_and_hand_rest(env):
     """For one second without actions the hand stays above, the balls stay in the bin, and neither touches the other."""
     env.reset(1)
     for _ in range(40):
-        result = env.step(still(env))
+        result = env.step(zero_actions(env))
         assert not result.info.ended.any()
     assert (env.sim.qpos[:, :3].abs() < 0.01).all() and env.sim.qvel.abs().max() < 1.0
     centres, gaps = (
@@ -296,12 +296,12 @@ def test_a_reset_restores_temperatures_in_its_environment_only(env, rolled):
     """In the finished environment balls and fingers are reset; in the other, temperatures continue."""
     press_on(env, rolled, [0, 0])
     for _ in range(60):
-        env.step(still(env))
+        env.step(zero_actions(env))
     old_heat = env.now.readings["heat/objects"][:, :, 0].clone()
     assert (hottest(env) > 25).all() and (old_heat[:, 0] < 44.98).all() and env.task.is_touched.all()
     old_memory = {name: value.clone() for name, value in env.task.memory.items()}
     env.sim.qpos[1, env.task.places[0][:3]] = torch.tensor([0.8, 0.0, 0.041]).double()  # on the ground outside the bin
-    result = env.step(still(env))
+    result = env.step(zero_actions(env))
     assert result.terminated.tolist() == [False, True] and not result.truncated.any()
     assert result.info.terms["lost"].tolist() == pytest.approx([0, -100 * env.control_step])
     objects = env.now.readings["heat/objects"][:, :, 0]
@@ -314,7 +314,7 @@ def test_a_reset_restores_temperatures_in_its_environment_only(env, rolled):
 
 def test_an_episode_is_truncated_at_its_length():
     env = bin_of_balls(2, episode="0.1 s", touch="none")
-    assert [bool(env.step(still(env)).truncated.all()) for _ in range(8)] == [False, False, False, True] * 2
+    assert [bool(env.step(zero_actions(env)).truncated.all()) for _ in range(8)] == [False, False, False, True] * 2
     assert "tactile_sensors" not in env.groups and env.task.cells.shape == (10, 8)  # the latch uses all fingers
     env.close()
 
@@ -337,7 +337,7 @@ def test_progress_does_not_depend_on_the_outputs_of_cells(tmp_path, rolled):
         env = bin_of_balls(1, document=str(tmp_path / f"{i}.yaml"))
         press_on(env, rolled, [0])
         for _ in range(10):
-            result = env.step(still(env))
+            result = env.step(zero_actions(env))
         readings.append(result.obs["priv_heat"])
         env.close()
     torch.testing.assert_close(*readings)
@@ -407,9 +407,9 @@ def test_other_kinds_of_touch_feel_every_ball(touch, rolled):
     env = bin_of_balls(2, touch=touch)
     env.reset(0)
     env.sim.qpos.copy_(rolled[:2])
-    before = env.step(still(env)).obs["tactile_sensors"]
+    untouched = env.step(zero_actions(env)).obs["tactile_sensors"]
     put_on(env, [0, 3], ahead=0.02)  # contact is on the pad, which faces down and back
     for _ in range(10):
-        after = env.step(still(env)).obs["tactile_sensors"]
-    assert ((after - before).abs().amax(dim=1) > 0).all() and after.isfinite().all()
+        touched = env.step(zero_actions(env)).obs["tactile_sensors"]
+    assert ((touched - untouched).abs().amax(dim=1) > 0).all() and touched.isfinite().all()
     env.close()

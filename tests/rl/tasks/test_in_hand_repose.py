@@ -204,12 +204,12 @@ def test_each_goal_must_be_held_and_the_next_starts_from_it(tmp_path, kind):
         np.testing.assert_allclose(obs["goal"][:, :6], columns, rtol=0, atol=1e-6)
         near_goal = Rotation.from_rotvec([0.05, 0, 0]) * goal  # within the tolerance, without effect on the next goal
         put(env, near_goal)
-        for held in range(1, 4):
+        for steps_held in range(1, 4):
             result = rest(env)
             obs = result.obs
-            assert result.info.terms["success"].tolist() == pytest.approx([500 * env.control_step * (held == 3)] * 3)
-            assert result.info.score.tolist() == [k + (held == 3)] * 3
-            if held < 3:
+            assert result.info.terms["success"].tolist() == pytest.approx([500 * env.control_step * (steps_held == 3)] * 3)
+            assert result.info.score.tolist() == [k + (steps_held == 3)] * 3
+            if steps_held < 3:
                 assert obs["goal"][:, 6].tolist() == pytest.approx([0.05] * 3, abs=1e-6)
         assert ((obs["goal"][:, 6] >= 0.35 - 1e-6) & (obs["goal"][:, 6] <= 0.45 + 1e-6)).all()
         # A change of the goal is no progress.
@@ -235,10 +235,10 @@ def test_a_goal_that_takes_too_long_terminates_the_episode(tmp_path):
     goal[1] = 0  # the second object stays in place
     put(env, Rotation.from_rotvec(goal))
     assert rest(env).info.score.tolist() == [1, 0]
-    made = rest(env)
-    assert made.terminated.tolist() == [False, True] and not made.truncated.any()
-    assert made.info.terms["goal_timeout"].tolist() == pytest.approx([0, -200 * env.control_step])
-    assert made.info.terms["drop"].tolist() == [0, 0]
+    result = rest(env)
+    assert result.terminated.tolist() == [False, True] and not result.truncated.any()
+    assert result.info.terms["goal_timeout"].tolist() == pytest.approx([0, -200 * env.control_step])
+    assert result.info.terms["drop"].tolist() == [0, 0]
     assert [rest(env).terminated.tolist() for _ in range(4)] == [[False, False], [False, False], [True, False], [False, True]]
 
 
@@ -249,8 +249,8 @@ def test_a_goal_reached_at_the_last_step_is_in_time(tmp_path):
         rest(env)
     put(env, Rotation.from_rotvec(0.4 * goal_axes(1, 2, 0)))
     rest(env)
-    made = rest(env)
-    assert made.info.score.tolist() == [1] and not made.terminated.any()
+    result = rest(env)
+    assert result.info.score.tolist() == [1] and not result.terminated.any()
 
 
 def test_a_dropped_object_terminates_the_episode(tmp_path):
@@ -258,9 +258,9 @@ def test_a_dropped_object_terminates_the_episode(tmp_path):
     env.reset()
     env.sim.qpos[:, 5] += torch.tensor([0.079, 0.081])
     env.sim.qvel[:, 3:] = 0
-    made = rest(env)
-    assert made.terminated.tolist() == [False, True]
-    assert made.info.terms["drop"].tolist() == pytest.approx([0, -100 * env.control_step])
+    result = rest(env)
+    assert result.terminated.tolist() == [False, True]
+    assert result.info.terms["drop"].tolist() == pytest.approx([0, -100 * env.control_step])
 
 
 def test_truncating_one_episode_does_not_affect_the_others(tmp_path):
@@ -270,16 +270,16 @@ def test_truncating_one_episode_does_not_affect_the_others(tmp_path):
     rest(env)
     env.steps[1] = env.max_steps - 1
     old_memory = {name: value.clone() for name, value in env.task.memory.items()}
-    made = rest(env)
-    assert made.truncated.tolist() == [False, True, False] and not made.terminated.any()
+    result = rest(env)
+    assert result.truncated.tolist() == [False, True, False] and not result.terminated.any()
     memory = env.task.memory
     assert memory["episode"].tolist() == [2, 3, 2] and memory["reached"].tolist() == [1, 0, 1]
     assert memory["waited"].tolist() == [1, 0, 1] and memory["held"].tolist() == [0, 0, 0]
     assert torch.equal(memory["goal"][[0, 2]], old_memory["goal"][[0, 2]])
     goal = Rotation.from_rotvec(0.4 * goal_axes(3, 3, 0)[1]).as_matrix()[:, :2].T.reshape(6)
-    np.testing.assert_allclose(made.obs["goal"][1, :6], goal, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(made.obs["goal"][1, 6], 0.4, rtol=0, atol=1e-6)
-    assert made.info.final_obs["goal"][1, :6].tolist() != made.obs["goal"][1, :6].tolist()
+    np.testing.assert_allclose(result.obs["goal"][1, :6], goal, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(result.obs["goal"][1, 6], 0.4, rtol=0, atol=1e-6)
+    assert result.info.final_obs["goal"][1, :6].tolist() != result.obs["goal"][1, :6].tolist()
 
 
 @pytest.mark.parametrize("kind", ["any", "vertical"])
@@ -387,5 +387,5 @@ def test_each_hand_holds_all_objects_without_actions(document, joints):
     env = TouchEnv(document, 16, threads=1, overrides=quiet)
     assert env.num_actions == joints and env.task.setup.num_variants == 16
     for _ in range(round(10 / env.control_step)):
-        made = rest(env)
-        assert not made.terminated.any(), f"{made.terminated.nonzero().flatten().tolist()} were lost"
+        result = rest(env)
+        assert not result.terminated.any(), f"{result.terminated.nonzero().flatten().tolist()} were lost"

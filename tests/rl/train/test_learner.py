@@ -15,21 +15,21 @@ def test_metrics_of_an_iteration(tmp_path):
     step = learner.env.step
 
     def recording_step(action):
-        made = step(action)
-        steps.append(made)
-        return made
+        result = step(action)
+        steps.append(result)
+        return result
 
     learner.env.step = recording_step
     iterations = [learner.iterate() for _ in range(4)]
-    assert [made.episodes for made in iterations] == [0, 4, 0, 4]
+    assert [result.episodes for result in iterations] == [0, 4, 0, 4]
     assert "Episode/return" not in iterations[0].metrics and iterations[1].metrics["Episode/steps"] == STEPS
-    returns = torch.stack([made.reward for made in steps[:STEPS]]).sum(dim=0).mean()
+    returns = torch.stack([result.reward for result in steps[:STEPS]]).sum(dim=0).mean()
     assert iterations[1].metrics["Episode/return"] == pytest.approx(float(returns), rel=1e-5)
     terms = sum(value for name, value in iterations[1].metrics.items() if name.startswith("Reward/"))
     assert iterations[1].metrics["Episode/return"] == pytest.approx(terms, rel=1e-4)
     assert iterations[1].metrics["Episode/dropped"] == 0.0
     assert learner.samples == 4 * 4 * 4 and learner.iteration == 4
-    assert all(made.rollout > 0 and made.update > 0 for made in iterations)
+    assert all(result.rollout > 0 and result.update > 0 for result in iterations)
 
 
 def test_curricula_follow_iterations_and_scores(tmp_path):

@@ -266,8 +266,8 @@ def test_a_user_defined_task_is_copied_with_its_documents(tmp_path):
 
 
 def test_differences_of_documents():
-    before = {"a": {"b": 1, "c": [1, 2]}, "d": 2.0}
-    assert differences(before, {"a": {"b": 3, "c": [1, 2]}, "e": 4}) == ["a.b: 1, now 3", "d: 2.0, now null", "e: null, now 4"]
+    old = {"a": {"b": 1, "c": [1, 2]}, "d": 2.0}
+    assert differences(old, {"a": {"b": 3, "c": [1, 2]}, "e": 4}) == ["a.b: 1, now 3", "d: 2.0, now null", "e: null, now 4"]
 
 
 def test_nan_losses_end_a_run_before_its_checkpoint(tmp_path):
@@ -400,7 +400,7 @@ def test_a_full_disk_is_reported_before_a_run_begins(tmp_path):
 def test_a_signal_ends_a_run_after_its_iteration(tmp_path, monkeypatch, number):
     """It writes a checkpoint and restores the signal handlers."""
     run, learner = started_run(tmp_path, every=1e9)
-    old_handlers = [signal.getsignal(own) for own in (signal.SIGINT, signal.SIGTERM)]
+    old_handlers = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
     iterate = learner.iterate
 
     def iterate_with_signal(share):
@@ -412,7 +412,7 @@ def test_a_signal_ends_a_run_after_its_iteration(tmp_path, monkeypatch, number):
     run.learn(5, float("inf"))
     assert (learner.iteration, run.stopped_by) == (2, number)
     assert read_checkpoint(run._folder.checkpoint)["iteration"] == 2
-    assert [signal.getsignal(own) for own in (signal.SIGINT, signal.SIGTERM)] == old_handlers
+    assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == old_handlers
 
 
 def test_a_second_interrupt_stops_at_once(tmp_path, monkeypatch):
