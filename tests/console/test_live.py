@@ -1,4 +1,4 @@
-"""Text on a terminal and on a pipe."""
+"""Live tables on a terminal and on a pipe."""
 
 import io
 
@@ -39,8 +39,7 @@ def test_a_terminal_is_drawn_over_at_most_once_per_period(monkeypatch):
     assert stream.getvalue().endswith("\x1b[3A\x1b[Jlast\n")
 
 
-def test_what_is_drawn_is_seen_at_once():
-    """The stream holds nothing back."""
+def test_output_is_flushed_at_once():
     raw = io.BytesIO()
     stream = io.TextIOWrapper(raw, encoding="utf-8", newline="\n")
     LiveTable(stream).show(["a", "b"], is_last=True)

@@ -1,4 +1,4 @@
-"""Long work says what it is doing: to whoever asks, and on a terminal."""
+"""Long work reports its progress, to callbacks and on a terminal."""
 
 import fcntl
 import io
@@ -49,10 +49,10 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_compile_tells_what_it_does_in_its_order(folder):
-    said = []
-    tgdsl.compile("pad.yaml", progress=said.append)
-    assert said == [
+def test_compile_reports_its_steps_in_order(folder):
+    messages = []
+    tgdsl.compile("pad.yaml", progress=messages.append)
+    assert messages == [
         "reading robot and scene",
         "placing taxels on pad (1 of 2 links)",
         "placing taxels on side (2 of 2 links)",
@@ -66,24 +66,24 @@ def test_compile_tells_what_it_does_in_its_order(folder):
 
 def test_variants_are_counted(folder):
     shapes = [{"type": "box", "size": [0.01] * 3}, {"type": "sphere", "size": [0.01]}]
-    said = []
+    messages = []
     overrides = {
         "objects": {"item": {"body": "item", "variants": shapes}},
         "sensors.near": {"kind": "contact", "links": "pad", "feels": ["item"]},
     }
-    tgdsl.compile("pad.yaml", overrides=overrides, progress=said.append)
-    assert [line for line in said if line.startswith("object")] == [
+    tgdsl.compile("pad.yaml", overrides=overrides, progress=messages.append)
+    assert [line for line in messages if line.startswith("object")] == [
         "object item: distances (1 of 2 variants)",
         "object item: distances (2 of 2 variants)",
     ]
 
 
-def test_who_is_told_changes_nothing(folder):
+def test_a_progress_callback_does_not_change_the_plan(folder):
     plans = [tgdsl.compile("pad.yaml", progress=progress).plan.to_json() for progress in (None, lambda what: None)]
     assert plans[0] == plans[1]
 
 
-def test_what_the_listener_raises_ends_the_work(folder):
+def test_an_exception_of_the_callback_ends_the_work(folder):
     def stop(what):
         if what.startswith("object"):
             raise KeyboardInterrupt
@@ -97,7 +97,7 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_a_status_line_is_drawn_over_itself_and_wiped(monkeypatch):
+def test_a_status_line_is_overwritten_and_wiped(monkeypatch):
     monkeypatch.setenv("COLUMNS", "11")
     screen = Terminal()
     monkeypatch.setattr(sys, "stderr", screen)
@@ -107,7 +107,7 @@ def test_a_status_line_is_drawn_over_itself_and_wiped(monkeypatch):
     assert screen.getvalue() == "\r\x1b[Ka first lo\r\x1b[Ksecond\r\x1b[K"
 
 
-def test_short_work_prints_nothing_where_there_is_no_terminal():
+def test_short_work_prints_nothing_without_a_terminal():
     stream = io.StringIO()
     with StatusLine(stream) as progress:
         progress("first")
@@ -120,8 +120,8 @@ def wait_for(stream: io.StringIO, text: str) -> None:
         time.sleep(0.01)
 
 
-def test_a_long_job_is_printed_once_where_there_is_no_terminal():
-    """Also while it blocks the thread that reported it."""
+def test_a_long_job_is_printed_once_without_a_terminal():
+    """Also while the job blocks the thread that reported it."""
     stream = io.StringIO()
     with StatusLine(stream, period=0.05) as progress:
         progress("long")
@@ -144,7 +144,7 @@ def test_lines_are_at_least_a_period_apart():
     assert 1 <= len(stream.getvalue().splitlines()) <= (time.monotonic() - begin) / 0.1
 
 
-def test_a_bar_counts_where_there_is_no_terminal(monkeypatch):
+def test_a_bar_prints_counts_without_a_terminal(monkeypatch):
     stream = io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
     monkeypatch.setattr(progress_module, "LINE_PERIOD", 0.05)
@@ -158,8 +158,8 @@ def test_a_bar_counts_where_there_is_no_terminal(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_command_on_a_terminal(folder):
-    """What is said stands on the terminal that standard error is; what is printed stays as it is."""
+def test_a_command_shows_progress_on_a_terminal(folder):
+    """Progress goes to standard error, which is the terminal; standard output is unchanged."""
     master, terminal = pty.openpty()
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "PYTHONWARNINGS": "error", "NO_COLOR": "1"}
@@ -176,24 +176,24 @@ def test_a_command_on_a_terminal(folder):
             if not part:
                 break
             shown += part
-        said, _ = process.communicate()
+        output, _ = process.communicate()
     assert process.returncode == 0, shown
     text = shown.decode()
-    for what in (
+    for message in (
         "object item: distances",
         "starting the simulation",
         "stepping",
         "drawing the picture",
         "drawing the overview",
     ):
-        assert what in text
+        assert message in text
     assert text.endswith("\r\x1b[K")
-    assert "drawing" not in said
-    assert said.splitlines()[-1] == "overview: out/overview.png"
+    assert "drawing" not in output
+    assert output.splitlines()[-1] == "overview: out/overview.png"
 
 
-def test_a_status_line_is_seen_at_once():
-    """The stream holds nothing back, neither of what is drawn nor of what is wiped."""
+def test_a_status_line_is_flushed_at_once():
+    """Both drawing and wiping are flushed."""
 
     class Screen(io.TextIOWrapper):
         def isatty(self) -> bool:

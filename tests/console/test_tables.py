@@ -1,4 +1,4 @@
-"""Tables as a user sees them, written out by hand."""
+"""Tables as users see them, against text by hand."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def test_cells_are_aligned_under_their_header():
     assert text_table(("a",), [("b",)], more=2) == "a\n─\nb\n… and 2 more"
 
 
-def test_names_stand_beside_what_they_hold():
+def test_a_listing_aligns_names_and_wraps_text():
     assert listing([("one", "first"), ("three", "")]) == "  one    first\n  three  none"
     assert listing([]) == ""
     first, second = listing([("name", " ".join(["word"] * 30))]).split("\n")
@@ -34,11 +34,11 @@ def test_names_stand_beside_what_they_hold():
         (("force", "bit"), ("N", "1"), "force [N], bit"),
     ],
 )
-def test_a_unit_stands_once_after_its_channels(channels, units, text):
+def test_a_unit_appears_once_after_its_channels(channels, units, text):
     assert with_units(channels, units) == text
 
 
-def test_shapes_are_those_of_all_tensors():
+def test_shapes_lists_dtypes_and_shapes():
     assert shapes({"a": np.zeros((2, 3)), "b": 3}) == "a float64 (2, 3), b int"
 
 
@@ -51,7 +51,7 @@ def test_long_tables_of_taxels_are_cut():
     assert type(rows["radius"]) is np.ndarray and type(rows[:2]) is TaxelTable
 
 
-def test_a_table_of_links_stands_once_for_sensors_on_the_same_taxels():
+def test_sensors_on_the_same_taxels_share_a_table():
     both = [("tip", "t", (0, 0, 0), 0.001, 2e-6), ("tip", "t", (0, 0, 0), 0.0025, 3e-6), ("pad", "p", (0, 0, 0), 0.0, 1e-6)]
     text = repr(TaxelTables({"one": table(*both), "two": table(*both), "three": table(both[0])}))
     first, second = text.split("\n\n")

@@ -1,4 +1,4 @@
-"""The cache has a bound: the least recently used entries go first, whoever else uses it at the same time."""
+"""The cache is bounded: the least recently used entries are removed first, also with concurrent users."""
 
 import os
 import subprocess
@@ -24,8 +24,8 @@ def place(tmp_path, monkeypatch) -> Path:
     return tmp_path / "cache"
 
 
-def bounded(monkeypatch, count: int) -> int:
-    """Bound the cache to so many entries; return the size of one."""
+def limit_cache(monkeypatch, count: int) -> int:
+    """Limit the cache to `count` entries; return the size of one."""
     value_of(-1)
     (entry,) = cache.entries()
     cache.evict(-1)
@@ -33,35 +33,35 @@ def bounded(monkeypatch, count: int) -> int:
     return entry.size
 
 
-def used(i: int, age: float) -> None:
-    """Have entry i last used so long ago [s]."""
+def set_last_use(i: int, age: float) -> None:
+    """Set how long ago entry i was last used [s]."""
     os.utime(cache.folder() / f"{key(i)}.npz", (1.7e9 - age, 1.7e9 - age))
 
 
-def there() -> set[int]:
+def entries_present() -> set[int]:
     return {i for i in range(40) if (cache.folder() / f"{key(i)}.npz").exists()}
 
 
-def test_the_least_recently_used_goes_first(monkeypatch):
-    size = bounded(monkeypatch, 4)
+def test_the_least_recently_used_entry_is_removed_first(monkeypatch):
+    size = limit_cache(monkeypatch, 4)
     for i in range(4):
         value_of(i)
     for i in range(4):
-        used(i, 100.0 - i)
-    made: list[int] = []
-    np.testing.assert_array_equal(value_of(0, made), np.zeros(VALUES))  # used again, so that 1 and 2 are now the oldest
-    assert not made
+        set_last_use(i, 100.0 - i)
+    computed: list[int] = []
+    np.testing.assert_array_equal(value_of(0, computed), np.zeros(VALUES))  # used again: 1 and 2 are now the oldest
+    assert not computed
     value_of(4)
-    assert there() == {0, 2, 3, 4}
+    assert entries_present() == {0, 2, 3, 4}
     value_of(5)
-    assert there() == {0, 3, 4, 5}
-    np.testing.assert_array_equal(value_of(1, made), np.ones(VALUES))
-    assert made == [1], "what went is made again"
+    assert entries_present() == {0, 3, 4, 5}
+    np.testing.assert_array_equal(value_of(1, computed), np.ones(VALUES))
+    assert computed == [1], "what went is made again"
     assert sum(entry.size for entry in cache.entries()) <= 4 * size
 
 
-def test_other_peoples_files_are_left_alone_and_unfinished_ones_are_not(place, monkeypatch):
-    bounded(monkeypatch, 1)
+def test_foreign_files_are_kept_and_abandoned_ones_removed(place, monkeypatch):
+    limit_cache(monkeypatch, 1)
     (place / "mine.npz").write_bytes(bytes(10**6))
     (place / ".notes.npz").write_bytes(bytes(10**6))
     old, new = place / ".0123456789abcdef.npz", place / ".fedcba9876543210.npz"
@@ -69,7 +69,7 @@ def test_other_peoples_files_are_left_alone_and_unfinished_ones_are_not(place, m
     new.write_bytes(bytes(10**6))
     os.utime(old, (1.7e9, 1.7e9))
     value_of(0)
-    assert there() == {0}
+    assert entries_present() == {0}
     assert {path.name for path in place.iterdir()} == {"mine.npz", ".notes.npz", new.name, f"{key(0)}.npz"}
 
 
@@ -79,8 +79,8 @@ def test_an_entry_larger_than_the_bound_is_not_kept(monkeypatch):
     assert cache.entries() == []
 
 
-def test_an_entry_is_a_new_file_like_any_other(place):
-    """Several users may share a cache folder; and nothing but the entry is left."""
+def test_an_entry_has_the_permissions_of_a_new_file(place):
+    """Several users may share a cache folder; no temporary file is left."""
     value_of(0)
     (entry,) = place.iterdir()
     (place / "plain").touch()
@@ -88,7 +88,7 @@ def test_an_entry_is_a_new_file_like_any_other(place):
 
 
 def test_an_entry_that_cannot_be_written_is_still_returned(place, monkeypatch):
-    """Half of it was written, say, before the disk was full: nothing is left."""
+    """A half-written entry on a full disk leaves no file."""
 
     def full(file, *_, **__):
         file.write(b"half")
@@ -100,7 +100,7 @@ def test_an_entry_that_cannot_be_written_is_still_returned(place, monkeypatch):
 
 
 @pytest.mark.parametrize("text", ["2 GB", "-1", "1e9", "x"])
-def test_a_bound_that_is_none(monkeypatch, text):
+def test_an_invalid_bound_is_refused(monkeypatch, text):
     monkeypatch.setenv("TGDSL_CACHE_BYTES", text)
     with pytest.raises(TgdslError) as caught:
         value_of(0)
@@ -109,23 +109,23 @@ def test_a_bound_that_is_none(monkeypatch, text):
     assert cache.max_bytes() == 2**31
 
 
-def test_a_file_that_another_process_removes_first_counts_once(monkeypatch):
-    """Two that evict at once take the same files, so that no more goes than must."""
-    size = bounded(monkeypatch, 40)
+def test_concurrent_evictions_remove_no_more_than_needed(monkeypatch):
+    """Two processes that evict at once choose the same files."""
+    size = limit_cache(monkeypatch, 40)
     for i in range(10):
         value_of(i)
-        used(i, 100.0 - i)
-    real: Callable[[], list[cache.Entry]] = cache.entries
+        set_last_use(i, 100.0 - i)
+    list_entries: Callable[[], list[cache.Entry]] = cache.entries
 
-    def then_another_evicts() -> list[cache.Entry]:
-        found = real()
-        monkeypatch.setattr(cache, "entries", real)
+    def list_before_another_evicts() -> list[cache.Entry]:
+        listed = list_entries()
+        monkeypatch.setattr(cache, "entries", list_entries)
         assert len(cache.evict(6 * size)) == 4
-        return found
+        return listed
 
-    monkeypatch.setattr(cache, "entries", then_another_evicts)
+    monkeypatch.setattr(cache, "entries", list_before_another_evicts)
     assert cache.evict(6 * size) == []
-    assert there() == {4, 5, 6, 7, 8, 9}
+    assert entries_present() == {4, 5, 6, 7, 8, 9}
 
 
 PROGRAM = """
@@ -140,9 +140,9 @@ for turn in range(6):
 """
 
 
-def test_several_processes_at_once(monkeypatch):
-    """Each reads what the others write and remove; nobody fails, and what is left is whole and within the bound."""
-    size = bounded(monkeypatch, 5)
+def test_several_processes_share_the_cache(monkeypatch):
+    """Each reads entries that the others write and remove; the rest is intact and within the bound."""
+    size = limit_cache(monkeypatch, 5)
     paths = [str(REPOSITORY / "tests" / "helpers"), str(REPOSITORY)]
     running = [subprocess.Popen([sys.executable, "-c", PROGRAM, *paths], stderr=subprocess.PIPE) for _ in range(3)]
     for process in running:
@@ -150,15 +150,15 @@ def test_several_processes_at_once(monkeypatch):
         assert process.returncode == 0, errors.decode()
     cache.evict(cache.max_bytes())
     assert sum(entry.size for entry in cache.entries()) <= 5 * size
-    for i in there():
-        made: list[int] = []
-        np.testing.assert_array_equal(value_of(i, made), np.full(VALUES, float(i)))
-        assert not made
+    for i in entries_present():
+        computed: list[int] = []
+        np.testing.assert_array_equal(value_of(i, computed), np.full(VALUES, float(i)))
+        assert not computed
 
 
 def test_the_command_shows_and_clears(tmp_path, place, here, monkeypatch):
     assert here(tmp_path, "cache") == (0, f"{place}: 0 entries, 0 bytes, of at most 2147483648 bytes\n", "")
-    size = bounded(monkeypatch, 4)
+    size = limit_cache(monkeypatch, 4)
     for i in range(3):
         value_of(i)
     (place / "mine.txt").write_text("x")
@@ -169,7 +169,7 @@ def test_the_command_shows_and_clears(tmp_path, place, here, monkeypatch):
 
 
 class Marker:
-    """Leaves a file behind where it is unpickled."""
+    """Writes a file when it is unpickled."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -178,15 +178,15 @@ class Marker:
         return open, (str(self.path), "w")
 
 
-def test_an_entry_runs_no_code_of_who_wrote_it(place, tmp_path):
-    """Several users may share a cache folder: a pickled object in an entry is damage."""
+def test_an_entry_cannot_run_code(place, tmp_path):
+    """Several users may share a cache folder: an entry with a pickled object counts as damaged."""
     place.mkdir()
     np.savez(place / f"{key(0)}.npz", value=np.array([Marker(tmp_path / "ran")], dtype=object))
     np.testing.assert_array_equal(value_of(0), np.zeros(VALUES))
     assert not (tmp_path / "ran").exists()
 
 
-def test_a_file_that_is_unfinished_for_an_hour_is_abandoned(place):
+def test_a_file_unfinished_for_an_hour_is_abandoned(place):
     place.mkdir()
     now = time.time()
     for name, hours in ((".0123456789abcdef.npz", 1.1), (".fedcba9876543210.npz", 0.9)):

@@ -1,4 +1,4 @@
-"""Files by name: of a folder of robots that is made here."""
+"""Files by name, in a folder of robots made for the test."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from tgdsl.files import find
 
 @pytest.fixture
 def robots(tmp_path, monkeypatch) -> Path:
-    """Two hands: `grip` has both sides, layouts of one side and of all, and colliders of all; `claw` has one model of its own name."""
+    """Two hands: `grip` has both sides, a layout for the left and one for both, and colliders; `claw` has one model."""
     place = tmp_path / "robots"
     for name in (
         *("grip/grip_left.xml", "grip/grip_right.xml", "grip/layout.yaml", "grip/layout_left.yaml", "grip/colliders.yaml"),
@@ -21,7 +21,7 @@ def robots(tmp_path, monkeypatch) -> Path:
     return place
 
 
-def test_a_folders_own_name_is_its_right_hand(robots):
+def test_a_folders_name_means_its_right_hand(robots):
     left, right = robots / "grip" / "grip_left.xml", robots / "grip" / "grip_right.xml"
     assert find.robot_names() == {
         "claw": robots / "claw" / "claw.xml",
@@ -31,12 +31,12 @@ def test_a_folders_own_name_is_its_right_hand(robots):
     }
 
 
-def test_a_model_of_the_folders_own_name_comes_before_its_right_hand(robots):
+def test_a_model_with_the_folders_name_comes_before_its_right_hand(robots):
     (robots / "grip" / "grip.xml").touch()
     assert find.robot_names()["grip"] == robots / "grip" / "grip.xml"
 
 
-def test_a_robot_is_given_by_name_or_by_its_file(robots, tmp_path):
+def test_a_robot_is_found_by_name_or_file(robots, tmp_path):
     (tmp_path / "mine.xml").touch()
     (tmp_path / "folder.xml").mkdir()
     assert find.robot_file("grip", tmp_path) == robots / "grip" / "grip_right.xml"
@@ -45,7 +45,7 @@ def test_a_robot_is_given_by_name_or_by_its_file(robots, tmp_path):
         assert find.robot_file(name, tmp_path) is None
 
 
-def test_what_lies_beside_a_model_is_of_its_side_or_of_all(robots):
+def test_layouts_and_colliders_belong_to_one_side_or_both(robots):
     left, right, claw = (robots / name for name in ("grip/grip_left.xml", "grip/grip_right.xml", "claw/claw.xml"))
     assert find.layout_file(left) == robots / "grip" / "layout_left.yaml"
     assert find.layout_file(right) == find.layout_of("grip") == robots / "grip" / "layout.yaml"

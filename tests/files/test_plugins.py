@@ -1,4 +1,4 @@
-"""Things that installed packages bring: by package and name, without those that fail, and none of two by one name."""
+"""Plugins of installed packages: named by package and version, without broken ones and without duplicates."""
 
 import linecache
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ def known(group: str, own=(), given=()) -> list[str]:
 
 @pytest.fixture
 def installed(monkeypatch, request):
-    """Return a group of entry points of this test's own, each to a name of this file."""
+    """Return a function that creates this test's group of entry points to names of this file."""
 
     def of(*names: str) -> str:
         group = f"{request.node.name}/{names}"
@@ -42,23 +42,23 @@ def installed(monkeypatch, request):
     return of
 
 
-def test_own_things_come_first_then_installed_ones_then_given_ones(installed):
+def test_builtin_things_come_first_then_installed_then_given_ones(installed):
     group = installed("TWO")
     assert known(group, [ONE], [Thing("three")]) == ["one", "two", "three"]
     assert known(group, [ONE], [TWO]) == ["one", "two"], "one that is installed may be given too"
 
 
-def test_two_of_one_name_are_refused(installed):
-    for own, given, whence in (
+def test_two_things_with_one_name_are_refused(installed):
+    for builtin, extra, packages in (
         ([SAME], [], "tgdsl, one of an unknown package"),
         ([], [SAME], "an unknown package, one of `things`"),
     ):
         with pytest.raises(TgdslError) as caught:
-            known(installed("ONE"), own, given)
-        assert str(caught.value) == f'two things are called "one": one of {whence}; rename or remove one'
+            known(installed("ONE"), builtin, extra)
+        assert str(caught.value) == f'two things are called "one": one of {packages}; rename or remove one'
 
 
-def test_what_is_no_thing_is_left_out_with_a_warning_and_refused_where_it_is_given(installed):
+def test_an_invalid_thing_is_left_out_if_installed_and_refused_if_given(installed):
     group = installed("NUMBER", "TWO", "missing")
     with pytest.warns(UserWarning, match="is left out") as caught:
         assert known(group) == ["two"]
@@ -70,9 +70,9 @@ def test_what_is_no_thing_is_left_out_with_a_warning_and_refused_where_it_is_giv
         known("none", given=[NUMBER])
 
 
-def test_packages_are_named_by_their_version(installed, monkeypatch):
+def test_packages_are_named_with_their_version(installed, monkeypatch):
     group = installed("ONE")
     (point,) = plugins.entry_points(group=group)
-    of_package = point._for(SimpleNamespace(name="fingers", version="1.2"))
-    monkeypatch.setattr(plugins, "entry_points", lambda group: [of_package])
+    packaged = point._for(SimpleNamespace(name="fingers", version="1.2"))
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [packaged])
     assert plugins.installed(group, "thing", wrong) == ((ONE, "fingers 1.2"),)

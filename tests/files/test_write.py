@@ -1,4 +1,4 @@
-"""Files that appear whole: their permissions are those of any new file, and nothing of the process is changed for it."""
+"""Atomic writes: files have the permissions of a new file, and the process stays unchanged."""
 
 import os
 from contextlib import suppress
@@ -18,13 +18,13 @@ from tgdsl.runtime.rollout import Recorder
 
 @pytest.fixture(scope="module")
 def touch(tmp_path_factory):
-    """A module, beside its scene."""
+    """Return a module, with its scene file next to it."""
     return joint_module(tmp_path_factory.mktemp("scene"), {"policy": ALL})
 
 
 @pytest.mark.filterwarnings("ignore:.*USD holds no")
 @pytest.mark.parametrize("umask", [0o022, 0o027, 0o077])
-def test_permissions_are_those_of_a_new_file(tmp_path, touch, umask):
+def test_written_files_have_the_permissions_of_a_new_file(tmp_path, touch, umask):
     (tmp_path / "scene.xml").write_text(ROBOT_XML)
     writers = {
         "a.safetensors": lambda path: tgdsl.save(touch, path),
@@ -43,7 +43,7 @@ def test_permissions_are_those_of_a_new_file(tmp_path, touch, umask):
 
 
 def test_the_process_keeps_its_umask(tmp_path, monkeypatch):
-    """It is one for all threads: whoever changes it for a moment changes the files of others."""
+    """All threads share the umask: changing it briefly would affect other files."""
 
     def refuse(mask):
         raise AssertionError("the umask was changed")
@@ -54,7 +54,7 @@ def test_the_process_keeps_its_umask(tmp_path, monkeypatch):
     assert (tmp_path / "a.txt").read_bytes() == b"text"
 
 
-def test_a_file_takes_the_place_of_another_or_leaves_it(tmp_path):
+def test_a_file_is_replaced_only_on_success(tmp_path):
     target = tmp_path / "a.txt"
     target.write_text("old")
 
@@ -88,22 +88,22 @@ def test_files_that_belong_together_appear_together(tmp_path):
 
 
 @pytest.mark.parametrize("folder", ["assets", "deep/er/assets"])
-def test_a_folder_made_for_files_that_failed_goes_again(tmp_path, folder):
+def test_a_folder_made_for_a_failed_write_is_removed(tmp_path, folder):
     (tmp_path / "a.xml").mkdir()
     with pytest.raises(FileError, match=r"a\.xml: this is a folder"):
         atomic_write_all({tmp_path / "a.xml": b"", tmp_path / folder / "a.obj": b"mesh"})
     assert [path.name for path in tmp_path.iterdir()] == ["a.xml"]
 
 
-def test_a_folder_that_something_was_put_into_stays(tmp_path):
+def test_a_folder_with_other_files_stays(tmp_path):
     with suppress(ZeroDivisionError), new_folder(tmp_path / "a" / "b" / "file"):
         (tmp_path / "a" / "other").touch()
         raise ZeroDivisionError
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["a", "other"]
 
 
-def test_whether_a_file_can_be_written_is_seen_before_anything_is_made(tmp_path):
-    """Its folder need not be there, but what is there of the way to it is a folder; the file itself is none."""
+def test_check_writable_finds_problems_without_creating_files(tmp_path):
+    """Folders may be missing, but existing parts of the path must be folders, and the target must not be one."""
     (tmp_path / "file").touch()
     (tmp_path / "folder").mkdir()
     before = sorted(tmp_path.rglob("*"))
@@ -119,7 +119,7 @@ def test_whether_a_file_can_be_written_is_seen_before_anything_is_made(tmp_path)
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_what_a_library_raises_comes_through_when_it_has_removed_its_file(tmp_path):
+def test_a_librarys_error_is_raised_even_if_it_removed_its_file(tmp_path):
     def fail() -> None:
         with atomic_path(tmp_path / "a.usda") as temporary:
             temporary.unlink()

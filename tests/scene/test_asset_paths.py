@@ -1,4 +1,4 @@
-"""An artefact that somebody else wrote opens no file but its own assets."""
+"""An untrusted artefact opens only its own assets."""
 
 import dataclasses
 import hashlib
@@ -52,7 +52,7 @@ def project(tmp_path_factory):
 
 
 def crafted(project: Path, folder: Path, change) -> Path:
-    """Write an artefact whose scene somebody has changed, all else in order."""
+    """Write a valid artefact with a changed scene."""
     content = (project / "hand.safetensors").read_bytes()
     header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
     plan = json.loads(header["__metadata__"]["tgdsl"])
@@ -61,7 +61,7 @@ def crafted(project: Path, folder: Path, change) -> Path:
     return folder / "evil.safetensors"
 
 
-def test_an_artefact_that_nobody_has_changed_is_loaded(project, tmp_path):
+def test_an_unchanged_artefact_loads(project, tmp_path):
     path = crafted(project, tmp_path, lambda scene: None)
     assert tgdsl.simulate(tgdsl.load(path), 1).model.nmesh == scene_model(load_plan(path).scene).nmesh == 2
 
@@ -92,7 +92,7 @@ PLACES = {
 
 
 @pytest.mark.parametrize("place", PLACES, ids=repr)
-def test_a_place_that_no_asset_has_is_refused_before_anything_is_opened(project, tmp_path, place):
+def test_an_invalid_asset_path_is_refused_before_any_file_is_opened(project, tmp_path, place):
     path = crafted(project, tmp_path, lambda scene: scene["assets"][0].update(path=place))
     OPENED.clear()
     with pytest.raises(ArtifactError) as caught:
@@ -133,36 +133,36 @@ TEXTS = {
 
 
 @pytest.mark.parametrize("case", TEXTS)
-def test_a_text_names_only_what_the_artefact_lists(project, tmp_path, case):
-    change, what = TEXTS[case]
+def test_a_scenes_text_may_name_only_listed_assets(project, tmp_path, case):
+    change, problem = TEXTS[case]
     with pytest.raises(ArtifactError) as caught:
         load_plan(crafted(project, tmp_path, change))
-    assert f"evil.safetensors: the scene's text {what}" in str(caught.value)
+    assert f"evil.safetensors: the scene's text {problem}" in str(caught.value)
 
 
-def test_names_of_assets_and_parts_are_hashes(project, tmp_path):
-    def renamed_asset(scene) -> None:
+def test_names_of_assets_and_parts_must_be_hashes(project, tmp_path):
+    def rename_asset(scene) -> None:
         scene["assets"][0]["key"] = "../a.stl"
 
-    def renamed_part(scene) -> None:
+    def rename_part(scene) -> None:
         scene["parts"] = {"/etc/a.xml": "<mujoco/>"}
 
-    def renamed_mesh(scene) -> None:
+    def rename_mesh(scene) -> None:
         scene["objects"][0]["variants"][0][0]["mesh"] = "/etc/a.stl"
 
-    for change, what in (
-        (renamed_asset, 'the scene has a file by the name "../a.stl", expected a hash'),
-        (renamed_part, 'the scene has a file by the name "/etc/a.xml", expected a hash with the ending .xml'),
-        (renamed_mesh, 'object "item" names the file "/etc/a.stl", which is none of the scene\'s assets'),
+    for change, problem in (
+        (rename_asset, 'the scene has a file by the name "../a.stl", expected a hash'),
+        (rename_part, 'the scene has a file by the name "/etc/a.xml", expected a hash with the ending .xml'),
+        (rename_mesh, 'object "item" names the file "/etc/a.stl", which is none of the scene\'s assets'),
     ):
         with pytest.raises(ArtifactError, match="evil") as caught:
             load_plan(crafted(project, tmp_path, change))
-        assert what in str(caught.value)
+        assert problem in str(caught.value)
 
 
 @pytest.mark.parametrize("kind", ["file", "folder", "robots", "chain", "loop"])
-def test_a_link_that_leads_elsewhere_is_refused_before_it_is_opened(project, tmp_path, monkeypatch, kind):
-    """The secret has just the content that the artefact wants, so that reading it would go unnoticed."""
+def test_an_asset_that_is_a_symbolic_link_is_refused_before_it_is_opened(project, tmp_path, monkeypatch, kind):
+    """The secret has the content that the artefact expects, so a read would go unnoticed."""
     secret = tmp_path / "secret" / "item.stl"
     secret.parent.mkdir()
     secret.write_bytes((project / "item.stl").read_bytes())
@@ -177,8 +177,8 @@ def test_a_link_that_leads_elsewhere_is_refused_before_it_is_opened(project, tmp
         link.symlink_to({"chain": place / "next.stl", "loop": link}.get(kind, secret))
     if kind == "robots":
         monkeypatch.setattr("tgdsl.scene.scene.robots_folder", lambda: place)
-    named = "robots:item.stl" if kind == "robots" else str(link)
-    path = crafted(project, tmp_path, lambda scene: scene["assets"][0].update(path=named))
+    asset_path = "robots:item.stl" if kind == "robots" else str(link)
+    path = crafted(project, tmp_path, lambda scene: scene["assets"][0].update(path=asset_path))
     scene = load_plan(path).scene
     OPENED.clear()
     with pytest.raises(ArtifactError) as caught:
@@ -191,7 +191,7 @@ def test_a_link_that_leads_elsewhere_is_refused_before_it_is_opened(project, tmp
     assert str(caught.value) == expected.get(kind, f"asset {link} of the scene is a link to {secret}; compile again")
 
 
-def test_what_is_no_file_is_refused_before_it_is_opened(project, tmp_path):
+def test_an_asset_that_is_not_a_file_is_refused_before_it_is_opened(project, tmp_path):
     os.mkfifo(tmp_path / "pipe.stl")
     (tmp_path / "folder.stl").mkdir()
     for name in ("pipe.stl", "folder.stl"):
@@ -201,8 +201,8 @@ def test_what_is_no_file_is_refused_before_it_is_opened(project, tmp_path):
         assert str(caught.value) == f"asset {tmp_path / name} of the scene is not a file; compile again"
 
 
-def test_a_place_of_windows_is_none_here(project, tmp_path, monkeypatch):
-    """Its module loads, as no file is needed for that; its scene is not looked for in the working folder."""
+def test_a_windows_path_is_not_resolved_here(project, tmp_path, monkeypatch):
+    """The module loads without the file; the scene does not look in the working folder."""
     (tmp_path / "C:").mkdir()
     (tmp_path / "C:" / "item.stl").write_bytes((project / "item.stl").read_bytes())
     monkeypatch.chdir(tmp_path)
@@ -212,8 +212,8 @@ def test_a_place_of_windows_is_none_here(project, tmp_path, monkeypatch):
     assert str(caught.value) == 'asset "C:/item.stl" of the scene is no place on this machine; compile again'
 
 
-def test_every_place_that_is_written_is_one_that_is_read(project):
-    """Assets of the user's own are kept by absolute path, those of the robots that come with tgdsl below their folder."""
+def test_every_asset_path_that_is_written_can_be_read(project):
+    """Users' assets have absolute paths; assets of bundled robots are relative to the robots' folder."""
     for path in (project / "item.stl", *sorted(robots_folder().rglob("*.stl"))[::10]):
         content = path.read_bytes()
         asset = Asset(f"{hashlib.sha256(content).hexdigest()[:32]}.stl", portable(path), hashlib.sha256(content).hexdigest())
@@ -224,7 +224,7 @@ def test_every_place_that_is_written_is_one_that_is_read(project):
         assert scene_model(scene).nmesh == 1
 
 
-def test_a_scene_whose_asset_an_artefact_would_not_read_is_not_compiled(tmp_path):
+def test_a_scene_with_an_unreadable_kind_of_asset_is_not_compiled(tmp_path):
     (tmp_path / "hill.data").write_bytes(bytes(8 + 4 * 4))
     (tmp_path / "scene.xml").write_text(
         "<mujoco><asset><hfield name='h' file='hill.data' size='1 1 1 1'/></asset><worldbody><geom type='hfield' hfield='h'/>"

@@ -1,4 +1,4 @@
-"""Primitive colliders in place of a link's own geoms: what meets what, and where."""
+"""Primitive colliders replace a link's geoms: pairs that collide, and where."""
 
 import mujoco
 import numpy as np
@@ -27,49 +27,49 @@ COLLIDERS = (
 )
 
 
-def changed(bits="", ball="", more="", colliders=COLLIDERS):
+def model_with_colliders(bits="", ball="", more="", colliders=COLLIDERS):
     return with_colliders(mujoco.MjSpec.from_string(SCENE.format(bits=bits, ball=ball, more=more)), colliders).compile()
 
 
-def contacts(model, **places):
-    """Return the names of geoms in contact and their distances [m], with slides and the ball at places."""
+def contact_distances(model, **positions):
+    """Return names and distances [m] of geoms in contact, with slides and the ball at some positions."""
     data = mujoco.MjData(model)
-    for name, value in places.items():
+    for name, value in positions.items():
         first = int(model.joint(name).qposadr[0])
         data.qpos[first : first + np.size(value)] = value
     mujoco.mj_forward(model, data)
-    found = {}
+    distances = {}
     for i in range(data.ncon):
         names = sorted(model.geom(int(geom)).name for geom in data.contact[i].geom)
-        found["+".join(names)] = float(data.contact[i].dist)
-    return found
+        distances["+".join(names)] = float(data.contact[i].dist)
+    return distances
 
 
-def test_objects_meet_every_collider_where_it_is():
+def test_objects_collide_with_every_collider():
     """A ball of 10 mm against a sphere of 20 mm, and against a capsule of 10 mm: distances from centres and radii."""
-    model = changed()
+    model = model_with_colliders()
     core, fine = collider_name("one", 0), collider_name("one", 1)
-    assert contacts(model, ball=[0, 0, 0.029]) == {f"ball+{core}": pytest.approx(-0.001, abs=1e-12)}
-    assert contacts(model, ball=[0.019, 0.1, 0.02]) == {f"ball+{fine}": pytest.approx(-0.001, abs=1e-12)}
-    assert contacts(model, ball=[0.035, 0.035, 0.035]) == {}  # in the mesh, which is only seen
+    assert contact_distances(model, ball=[0, 0, 0.029]) == {f"ball+{core}": pytest.approx(-0.001, abs=1e-12)}
+    assert contact_distances(model, ball=[0.019, 0.1, 0.02]) == {f"ball+{fine}": pytest.approx(-0.001, abs=1e-12)}
+    assert contact_distances(model, ball=[0.035, 0.035, 0.035]) == {}  # inside the mesh, which is only visual
 
 
-def test_links_meet_by_their_cores_alone():
+def test_links_collide_only_through_their_cores():
     cores = "+".join((collider_name("one", 0), collider_name("two", 0)))
-    assert contacts(changed(), one=0.961) == {cores: pytest.approx(-0.001, abs=1e-12)}
-    fine = [Collider(own.body, own.type, own.size, own.pos, own.quat, False) for own in COLLIDERS]
-    assert contacts(changed(colliders=fine), one=0.961) == {}
+    assert contact_distances(model_with_colliders(), one=0.961) == {cores: pytest.approx(-0.001, abs=1e-12)}
+    fine = [Collider(core.body, core.type, core.size, core.pos, core.quat, False) for core in COLLIDERS]
+    assert contact_distances(model_with_colliders(colliders=fine), one=0.961) == {}
 
 
-def test_links_that_did_not_meet_do_not_meet():
-    model = changed(bits='contype="0" conaffinity="1"')
-    assert contacts(model, one=0.961) == {}
-    assert list(contacts(model, ball=[0, 0, 0.029])) == [f"ball+{collider_name('one', 0)}"]
+def test_links_that_did_not_collide_still_do_not():
+    model = model_with_colliders(bits='contype="0" conaffinity="1"')
+    assert contact_distances(model, one=0.961) == {}
+    assert list(contact_distances(model, ball=[0, 0, 0.029])) == [f"ball+{collider_name('one', 0)}"]
 
 
-def test_nothing_else_of_the_model_changes():
-    """Masses, inertias and what a contact is besides its shape are those of the geoms in whose place the colliders are."""
-    plain, model = mujoco.MjModel.from_xml_string(SCENE.format(bits="", ball="", more="")), changed()
+def test_colliders_change_only_the_collision_shapes():
+    """Masses, inertias and contact parameters are those of the replaced geoms."""
+    plain, model = mujoco.MjModel.from_xml_string(SCENE.format(bits="", ball="", more="")), model_with_colliders()
     for field in ("body_mass", "body_inertia", "body_ipos", "body_iquat", "jnt_axis", "qpos0"):
         np.testing.assert_array_equal(getattr(model, field), getattr(plain, field))
     geom = model.geom(collider_name("one", 1))
@@ -106,21 +106,21 @@ def test_an_empty_list_changes_nothing():
         ),
     ],
 )
-def test_what_would_be_lost_is_refused(given, says):
+def test_contacts_that_would_be_lost_are_refused(given, says):
     with pytest.raises(RobotError) as error:
-        changed(**given)
+        model_with_colliders(**given)
     assert str(error.value) == says
 
 
-def test_bits_that_are_all_taken_are_an_error():
+def test_no_free_collision_bit_is_an_error():
     with pytest.raises(RobotError) as error:
-        changed(bits=f'contype="{2**31 - 1}"')
+        model_with_colliders(bits=f'contype="{2**31 - 1}"')
     says = "the scene's geoms use all bits of `contype` and `conaffinity`; links with primitive colliders need a free one"
     assert str(error.value) == says
 
 
-def test_what_meets_one_of_a_links_geoms_by_its_conaffinity_alone_is_refused():
-    """The link's first geom has no `contype` and does not meet the ball; its second one does."""
+def test_a_geom_that_collides_only_by_its_conaffinity_is_refused():
+    """The link's first geom has no `contype` and does not collide with the ball; its second one does."""
     spec = mujoco.MjSpec.from_string(SCENE.format(bits="", ball='contype="0" conaffinity="1"', more=""))
     spec.geom("one").contype = 0
     spec.body("one").add_geom(name="more", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.01, 0, 0])
@@ -128,8 +128,8 @@ def test_what_meets_one_of_a_links_geoms_by_its_conaffinity_alone_is_refused():
         with_colliders(spec, COLLIDERS)
 
 
-def test_sizes_are_those_of_the_type():
-    """MuJoCo's own model of a sphere and a capsule has zeros beyond its radius and half length."""
-    model = changed()
+def test_sizes_beyond_those_of_the_type_are_zero():
+    """As in MuJoCo's models of spheres and capsules."""
+    model = model_with_colliders()
     for i, size in enumerate(([0.02, 0, 0], [0.01, 0.05, 0])):
         np.testing.assert_array_equal(model.geom(collider_name("one", i)).size, size)

@@ -1,4 +1,4 @@
-"""A kept scene is the loaded one in every field of MuJoCo's model, and a field that differs is named."""
+"""A saved scene equals the loaded one in every field of MuJoCo's model; a field that differs is named."""
 
 import copy
 from pathlib import Path
@@ -59,7 +59,7 @@ RICH = """
 <keyframe><key name="k" time="1.5" ctrl=".1 .2 .3 .4"/></keyframe>
 </mujoco>
 """
-"""Something of nearly everything that MJCF knows."""
+"""An example of nearly every MJCF element."""
 
 
 @pytest.fixture
@@ -70,27 +70,27 @@ def rich(tmp_path):
 
 
 def fields_of(struct: str, prefix: str = "") -> list[str]:
-    """Return MuJoCo's own list of a structure's fields, dotted where they are in structures."""
-    found = []
+    """Return MuJoCo's list of a structure's fields, with dots for nested structures."""
+    names = []
     for field in structs.STRUCTS[struct].fields:
         name = {"global": "global_"}.get(field.name, field.name)
         kind = getattr(field.type, "name", "")
         if not prefix and name == "buffer":
-            continue  # the memory that all arrays lie in
+            continue  # the memory of all arrays
         if kind in structs.STRUCTS:
-            found += fields_of(kind, f"{prefix}{name}.")
+            names += fields_of(kind, f"{prefix}{name}.")
         elif not hasattr(field.type, "fields"):
-            found.append(prefix + name)
-        else:  # mjVisual's parts have no names of their own
-            found += [f"{prefix}{name}.{part.name}" for part in field.type.fields]
-    return found
+            names.append(prefix + name)
+        else:  # mjVisual's parts are unnamed
+            names += [f"{prefix}{name}.{part.name}" for part in field.type.fields]
+    return names
 
 
 FIELDS = fields_of("mjModel")
 PATH_FIELDS = {"paths", "npaths", "mesh_pathadr", "hfield_pathadr", "skin_pathadr", "tex_pathadr", "nbuffer"}
-"""Where files were found, and the size of the memory that holds it."""
+"""Paths of files, and the size of the memory for them."""
 SHARED = {name: ["flg_gravcomp", "ngravcomp"] for name in ("flg_gravcomp", "ngravcomp")}
-"""Fields that are two names of one number."""
+"""Fields with two names."""
 
 
 def owner_of(model: mujoco.MjModel, name: str):
@@ -100,8 +100,8 @@ def owner_of(model: mujoco.MjModel, name: str):
     return model, last
 
 
-def changed(model: mujoco.MjModel, name: str) -> mujoco.MjModel | None:
-    """Return a copy in which the last number of a field is the next one that there is; None if that cannot be."""
+def with_changed_field(model: mujoco.MjModel, name: str) -> mujoco.MjModel | None:
+    """Return a copy in which the last number of a field is the next representable one, or None if it cannot change."""
     other = copy.copy(model)
     owner, last = owner_of(other, name)
     value = getattr(owner, last)
@@ -121,15 +121,15 @@ def changed(model: mujoco.MjModel, name: str) -> mujoco.MjModel | None:
     try:
         setattr(owner, last, not value if is_bool else float(np.nextafter(np.float32(value), 9)) if is_real else value + 1)
     except AttributeError:
-        return None  # a count, which MuJoCo lets nobody change
+        return None  # a count, which MuJoCo makes read-only
     return other
 
 
-def test_every_field_of_mujocos_model_that_can_be_changed_is_named_when_it_is(rich):
+def test_every_changed_field_of_mujocos_model_is_named(rich):
     model = rich.compiled
     tried = []
     for name in FIELDS:
-        other = changed(model, name)
+        other = with_changed_field(model, name)
         if other is None:
             continue
         tried.append(name)
@@ -139,24 +139,24 @@ def test_every_field_of_mujocos_model_that_can_be_changed_is_named_when_it_is(ri
     assert len(tried) > 450, "nearly all of them"
 
 
-def test_nothing_of_mujocos_model_is_left_out(rich):
-    """Counts, which cannot be changed, and the bytes of names are compared in models that have other ones."""
+def test_all_fields_of_mujocos_model_are_compared(rich):
+    """Read-only counts and names are compared between different models."""
     empty = mujoco.MjModel.from_xml_string("<mujoco model='none'><option timestep='.1'/></mujoco>")
-    found = {*differing_fields(rich.compiled, empty)}
-    alike = {name for name in FIELDS if np.array_equal(*(getattr(*owner_of(m, name)) for m in (rich.compiled, empty)))}
-    assert {*FIELDS} - found == alike | {name for name in FIELDS if name in PATH_FIELDS}
-    assert found >= {"names", "nbody", "ngeom", "text_data", "signature"}
+    differing = {*differing_fields(rich.compiled, empty)}
+    equal = {name for name in FIELDS if np.array_equal(*(getattr(*owner_of(m, name)) for m in (rich.compiled, empty)))}
+    assert {*FIELDS} - differing == equal | {name for name in FIELDS if name in PATH_FIELDS}
+    assert differing >= {"names", "nbody", "ngeom", "text_data", "signature"}
 
 
 @pytest.mark.parametrize("wanted", [NOTHING, PRESSED], ids=["no sensors", "sensors"])
 @pytest.mark.parametrize("has_objects", [False, True], ids=["as it is", "with objects"])
-def test_a_rich_scene_is_kept_to_the_last_bit(rich, wanted, has_objects):
+def test_a_rich_scene_is_saved_exactly(rich, wanted, has_objects):
     ball = NewBody("ball", (0.1, 0.2, 1 / 3), (1.0, 2.0, 3.0, 4.0), True)
     bodies = (ball, NewBody("block", (0.3, 0.0, 1.0), (0.6, 0.8, 0.0, 0.0), False))
-    own = OwnObjects(bodies=bodies if has_objects else ())
-    scene = with_bodies(rich, own.bodies)
+    objects = OwnObjects(bodies=bodies if has_objects else ())
+    scene = with_bodies(rich, objects.bodies)
     expected = instrument(scene.spec.copy(), wanted).compile()
-    assert differing_fields(expected, scene_model(scene_file(scene, wanted, own))) == []
+    assert differing_fields(expected, scene_model(scene_file(scene, wanted, objects))) == []
     same = [name for name in FIELDS if not name.startswith(("sensor", "name", "nname", "nsensor", "signature"))]
     assert not {*differing_fields(scene.compiled, expected)} & {*same}, "sensors alone were added"
 
@@ -176,15 +176,15 @@ CASES = {
 
 
 @pytest.mark.parametrize("field", CASES)
-def test_a_scene_that_would_be_kept_otherwise_is_refused_by_the_name_of_the_field(rich, monkeypatch, field):
+def test_a_scene_that_would_be_saved_differently_is_refused_with_the_field(rich, monkeypatch, field):
     old, new = CASES[field]
 
-    def otherwise(scene, assets):
+    def compiled_differently(scene, assets):
         assert scene.mjcf.count(old) == 1
         object.__setattr__(scene, "mjcf", scene.mjcf.replace(old, new))
         return compiled(scene, assets)
 
-    monkeypatch.setattr("tgdsl.compiler.scene.compiled", otherwise)
+    monkeypatch.setattr("tgdsl.compiler.scene.compiled", compiled_differently)
     with pytest.raises(RobotError, match=r"cannot be saved faithfully: in MuJoCo's model .*\b" + field + r"\b.* would differ"):
         scene_file(rich, NOTHING)
 
@@ -201,14 +201,14 @@ URDF = """
 """
 
 
-def test_urdf_is_kept_to_the_digits_that_mujoco_writes(tmp_path):
+def test_urdf_is_saved_to_the_digits_that_mujoco_writes(tmp_path):
     (tmp_path / "hand.urdf").write_text(URDF)
     loaded = load_model(tmp_path / "hand.urdf")
-    kept = scene_model(scene_file(loaded, NOTHING))
-    assert {"geom_pos", "jnt_range"} <= {*differing_fields(loaded.compiled, kept)}, "six digits of nine"
-    assert differing_fields(loaded.compiled, kept, is_rounded=True) == []
+    saved = scene_model(scene_file(loaded, NOTHING))
+    assert {"geom_pos", "jnt_range"} <= {*differing_fields(loaded.compiled, saved)}, "six digits of nine"
+    assert differing_fields(loaded.compiled, saved, is_rounded=True) == []
     for name in ("opt.timestep", "geom_solimp", "jnt_range", "dof_damping", "geom_contype"):
-        owner, last = owner_of(other := copy.copy(kept), name)
+        owner, last = owner_of(other := copy.copy(saved), name)
         setattr(owner, last, getattr(owner, last) * 1.001 + 1)
         assert differing_fields(loaded.compiled, other, is_rounded=True) == [name]
 
@@ -223,12 +223,12 @@ sensors: {touch: {kind: contact_depth, links: r_pad, feels: [item]}, load: {kind
 """
 
 
-def test_what_is_saved_and_loaded_again_is_the_scene_with_its_sensors(rich, tmp_path):
+def test_a_saved_and_loaded_scene_has_its_sensors(rich, tmp_path):
     (tmp_path / "hand.yaml").write_text(DOCUMENT)
     plan = compile_document(tmp_path / "hand.yaml").plan
     save_plan(plan, tmp_path / "hand.safetensors")
     for file in ("scene.xml", "hand.xml", "hand.yaml"):
         Path(tmp_path / file).unlink()
-    again = scene_model(load_plan(tmp_path / "hand.safetensors").scene)
-    assert differing_fields(instrument(rich.spec.copy(), plan.inputs).compile(), again) == []
-    assert again.nsensor > rich.compiled.nsensor
+    loaded = scene_model(load_plan(tmp_path / "hand.safetensors").scene)
+    assert differing_fields(instrument(rich.spec.copy(), plan.inputs).compile(), loaded) == []
+    assert loaded.nsensor > rich.compiled.nsensor

@@ -1,4 +1,4 @@
-"""A document's objects weigh what their densities say, and the scene's bodies what they weigh without them."""
+"""A document's objects have the masses of their densities; the scene's bodies keep their masses."""
 
 import mujoco
 import numpy as np
@@ -44,9 +44,9 @@ EXACT = 1e-9
 
 
 def scene_of(folder, options="", default="", **objects):
-    """Return the models of a compiled document's scene, and the scene's own model."""
+    """Return the models of a compiled document's scene, and the model of the scene file."""
     text = SCENE.format(options=options, default=default)
-    if "false" in options:  # MuJoCo then wants the inertia of each body that moves
+    if "false" in options:  # MuJoCo then needs an inertia for each moving body
         for joint in ("<freejoint/>", '<joint type="hinge" axis="1 0 0"/>'):
             text = text.replace(joint, f"{joint}<inertial pos='0 0 .01' mass='.3' diaginertia='.02 .03 .025'/>")
     (folder / "scene.xml").write_text(text)
@@ -70,8 +70,8 @@ def cache(tmp_path_factory, monkeypatch):
 
 @pytest.mark.filterwarnings("ignore:.*settotalmass")
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
-def test_each_option_of_the_compiler(tmp_path, options):
-    """Closed form: a ball off its body's origin, or a box. The others weigh what MuJoCo makes of the scene without objects."""
+def test_masses_do_not_depend_on_the_compilers_options(tmp_path, options):
+    """Closed form: a ball off its body's origin, or a box. Other bodies weigh the same as without objects."""
     target = {"variants": [BALL, BOX], "pos": [0, 0, 1]}
     scenes, alone = scene_of(tmp_path, options, item=target, still={"geom": BALL, "joint": "fixed"})
     for variant, mass in enumerate(MASSES):
@@ -83,35 +83,37 @@ def test_each_option_of_the_compiler(tmp_path, options):
         np.testing.assert_allclose(np.sort(item.inertia), np.sort(mass * (ball, box)[variant]), rtol=EXACT)
         assert model.body("still").mass[0] == pytest.approx(MASSES[0], rel=EXACT)
         for name in ("pad", "pin", "held"):
-            own, other = model.body(name), alone.body(name)
-            np.testing.assert_allclose([*own.mass, *own.inertia], [*other.mass, *other.inertia], rtol=EXACT, err_msg=name)
-            np.testing.assert_allclose([*own.ipos, *own.iquat], [*other.ipos, *other.iquat], atol=EXACT, err_msg=name)
+            body, expected = model.body(name), alone.body(name)
+            np.testing.assert_allclose(
+                [*body.mass, *body.inertia], [*expected.mass, *expected.inertia], rtol=EXACT, err_msg=name
+            )
+            np.testing.assert_allclose([*body.ipos, *body.iquat], [*expected.ipos, *expected.iquat], atol=EXACT, err_msg=name)
 
 
 @pytest.mark.parametrize("options", ["", "inertiagrouprange='2 3'"])
-def test_geoms_of_the_scenes_own_body(tmp_path, options):
-    """The body has no inertia of its own, so that its new geoms weigh, of whatever group they are."""
+def test_new_geoms_of_a_scenes_body_give_its_mass(tmp_path, options):
+    """The body has no inertia element, so its new geoms give its mass, whatever their group."""
     scenes, _ = scene_of(tmp_path, options, held={"body": "held", "variants": [BALL, {"geoms": [BALL, BOX]}]})
     masses = [scenes.model({"held": Choice(v)}).body("held").mass[0] for v in (0, 1)]
     np.testing.assert_allclose(masses, [MASSES[0], sum(MASSES)], rtol=EXACT)
 
 
-def test_meshes_weigh_too(tmp_path):
+def test_a_mesh_has_the_mass_of_its_density(tmp_path):
     trimesh.creation.box((0.02, 0.04, 0.06)).export(tmp_path / "brick.stl")
     brick = {"mesh": str(tmp_path / "brick.stl"), "density": 300, "scale": 1.0}
     scenes, _ = scene_of(tmp_path, "inertiafromgeom='false'", item={"geom": brick, "pos": [0, 0, 1]})
     assert scenes.model({}).body("item").mass[0] == pytest.approx(MASSES[1], rel=1e-5)
 
 
-def test_defaults_of_the_scene_are_for_its_own_geoms(tmp_path):
+def test_the_scenes_defaults_do_not_apply_to_objects(tmp_path):
     """Every parameter of the object's geom is as in a model without defaults; its joint is MuJoCo's free joint."""
     scenes, _ = scene_of(tmp_path, default=LEAKS, item={"geom": BALL, "pos": [0, 0, 1]})
     plain, model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>"), scenes.model({})
-    own = int(model.body("item").geomadr[0])
+    geom = int(model.body("item").geomadr[0])
     names = ("condim", "contype", "conaffinity", "priority", "friction", "solmix", "solref", "solimp", "margin", "gap", "group")
     for name in (*names, "rgba", "fluid", "matid"):
-        np.testing.assert_array_equal(getattr(model, f"geom_{name}")[own], getattr(plain, f"geom_{name}")[0], err_msg=name)
-    assert model.geom_type[own] == mujoco.mjtGeom.mjGEOM_SPHERE
+        np.testing.assert_array_equal(getattr(model, f"geom_{name}")[geom], getattr(plain, f"geom_{name}")[0], err_msg=name)
+    assert model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE
     assert model.body("item").mass[0] == pytest.approx(MASSES[0], rel=EXACT)
     first = int(model.body("item").dofadr[0])
     assert not model.dof_damping[first : first + 6].any() and not model.dof_armature[first : first + 6].any()

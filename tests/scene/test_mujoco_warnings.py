@@ -1,4 +1,4 @@
-"""What MuJoCo warns of is told once, with the file named, and neither printed nor logged."""
+"""MuJoCo's warnings are raised once, with the file's name, and neither printed nor logged."""
 
 import os
 import subprocess
@@ -25,44 +25,44 @@ DEPRECATED = "<mujoco><compiler settotalmass='3'/><worldbody><body><freejoint/><
 @pytest.mark.parametrize(
     ("name", "text", "what"), [("r.urdf", MIMIC, "<mimic> on joint 'j'"), ("r.xml", DEPRECATED, "settotalmass")]
 )
-def test_a_model_s_are_told_once(tmp_path, monkeypatch, capfd, name, text, what):
+def test_warnings_of_a_model_are_raised_once(tmp_path, monkeypatch, capfd, name, text, what):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / name
     path.write_text(text)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         load_model(path)
-    said = [str(w.message) for w in caught]
-    assert len(said) == 1 and said[0].startswith(f"{path}: MuJoCo: ") and what in said[0]
+    messages = [str(w.message) for w in caught]
+    assert len(messages) == 1 and messages[0].startswith(f"{path}: MuJoCo: ") and what in messages[0]
     assert capfd.readouterr() == ("", "") and [p.name for p in tmp_path.iterdir()] == [name]
 
 
-def test_they_end_no_process(tmp_path):
-    """A Python exception inside MuJoCo's callback would."""
+def test_warnings_as_errors_do_not_abort_the_process(tmp_path):
+    """A Python exception inside MuJoCo's callback would abort it."""
     (tmp_path / "r.urdf").write_text(MIMIC)
     environment = {**os.environ, "PYTHONWARNINGS": "error", "PYTHONPATH": str(REPOSITORY)}
     code = "from pathlib import Path\nfrom tgdsl.formats.robot import load_model\nload_model(Path('r.urdf'))"
-    ran = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
     )
-    assert ran.returncode == 1, ran.stderr
-    assert "UserWarning: r.urdf: MuJoCo: <mimic> on joint 'j' ignored" in ran.stderr
+    assert result.returncode == 1, result.stderr
+    assert "UserWarning: r.urdf: MuJoCo: <mimic> on joint 'j' ignored" in result.stderr
     assert [p.name for p in tmp_path.iterdir()] == ["r.urdf"]
 
 
-def test_a_handler_of_the_user_s_is_given_back():
-    own = lambda message: None  # noqa: E731
+def test_the_users_handler_is_restored():
+    handler = lambda message: None  # noqa: E731
     before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(own)
+    mujoco.set_mju_user_warning(handler)
     try:
         with pytest.raises(ValueError, match="broken"), located_warnings("x"):
             raise ValueError("broken")
-        assert mujoco.get_mju_user_warning() is own
+        assert mujoco.get_mju_user_warning() is handler
     finally:
         mujoco.set_mju_user_warning(before)
 
 
-def test_others_keep_their_words_and_kind():
+def test_other_warnings_keep_their_message_and_category():
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         with located_warnings("hand.xml"):
@@ -86,14 +86,14 @@ def test_a_simulation_that_diverges_prints_and_logs_nothing(tmp_path, monkeypatc
     assert capfd.readouterr() == ("", "") and sorted(path.name for path in tmp_path.iterdir()) == names
 
 
-def test_a_step_s_are_told_once_each_whatever_their_numbers():
-    told = StepWarnings()
+def test_each_warning_of_a_step_is_raised_once_for_any_numbers():
+    step_warnings = StepWarnings()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        told.warn(
+        step_warnings.warn(
             ["Pre-allocated constraint buffer is full (12). Time = 0.1000.\n\n", "Nan, Inf or huge value in QACC at DOF 0."]
         )
-        told.warn(["Pre-allocated constraint buffer is full (13). Time = 0.2000.\n\n", "Another thing. Time = 1e-3."])
+        step_warnings.warn(["Pre-allocated constraint buffer is full (13). Time = 0.2000.\n\n", "Another thing. Time = 1e-3."])
     assert [str(w.message) for w in caught] == [
         "MuJoCo: Pre-allocated constraint buffer is full (12). Time = 0.1000.; shown once",
         "MuJoCo: Another thing. Time = 1e-3.; shown once",

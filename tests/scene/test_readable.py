@@ -11,7 +11,7 @@ FACES = ((1, 3, 2), (1, 2, 4), (1, 4, 3), (2, 3, 4))
 
 
 def obj(*names: str) -> bytes:
-    """Return an OBJ file of tetrahedra of 1/6 m³, each 10 m from the last, each after a line that names it."""
+    """Return an OBJ file of tetrahedra of 1/6 m³, 10 m apart, each after a line with its name."""
     text = ""
     for i, name in enumerate(names):
         faces = "".join(f"f {' '.join(str(4 * i + corner) for corner in face)}\n" for face in FACES)
@@ -26,14 +26,14 @@ def volume(content: bytes) -> float:
 
 
 @pytest.mark.parametrize("names", [("o one",), ("g one",), ("# nothing",), ("o empty\no one",)])
-def test_one_object_is_left_alone(names):
+def test_a_file_with_one_object_is_unchanged(names):
     content = obj(*names)
     assert num_objects(content) == 1
     assert readable("m.obj", content) is content
 
 
 @pytest.mark.parametrize("names", [("o one", "o two"), ("g one", "  g two"), ("o one", "g"), ("o a", "o b", "g c")])
-def test_all_objects_are_one_mesh(names):
+def test_all_objects_of_a_file_become_one_mesh(names):
     """Closed form: a tetrahedron of unit edges along the axes has 1/6 m³."""
     content = obj(*names)
     assert num_objects(content) == len(names)
