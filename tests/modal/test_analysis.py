@@ -1,4 +1,4 @@
-"""From shape and material to frequencies [Hz], decays [1/s] and gains [1/kg]; which modes are kept; what is an error."""
+"""From shape and material to frequencies [Hz], decays [1/s] and gains [1/kg]; the modes that are kept; and errors."""
 
 import dataclasses
 
@@ -23,8 +23,8 @@ def shared_cache(tmp_path_factory, monkeypatch):
 
 
 def shape_modes(material: Material | str, count: int = 8) -> ShapeModes:
-    known = MATERIALS[material] if isinstance(material, str) else material
-    return ShapeModes.model_construct(material=known, count=count)
+    resolved = MATERIALS[material] if isinstance(material, str) else material
+    return ShapeModes.model_construct(material=resolved, count=count)
 
 
 STEEL = shape_modes("steel")

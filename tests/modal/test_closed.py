@@ -31,8 +31,8 @@ def test_triangles_with_separate_corners_are_joined():
     """As STL files store them, and slightly apart."""
     mesh = box((0.1, 0.1, 0.1))
     noise = 1e-10 * np.random.default_rng(0).standard_normal((36, 3))
-    apart = mesh.vertices[mesh.faces].reshape(-1, 3) + noise
-    vertices, faces = closed(changed(mesh, apart, np.arange(36).reshape(-1, 3)))
+    corners = mesh.vertices[mesh.faces].reshape(-1, 3) + noise
+    vertices, faces = closed(changed(mesh, corners, np.arange(36).reshape(-1, 3)))
     assert len(vertices) == 8 and len(faces) == 12
     assert enclosed(vertices, faces) == pytest.approx(CUBE)
 
