@@ -54,7 +54,7 @@ def errors() -> dict[str, float]:
     for name, case in CASES.items():
         lines, matrices = inputs(*case)
         error = (LINK_PRODUCTS(lines, matrices) - exact_products(lines, matrices)).abs()
-        # Each of n products and n sums rounds, by half of eps of what was added up.
+        # Each of n products and n sums rounds by half of eps of the sum so far.
         bound = max(case[1]) * EPS * exact_products(lines.abs(), [matrix.abs() for matrix in matrices])
         ratios[name] = float((error / bound.clamp(min=1e-30)).max())
     return ratios

@@ -1,4 +1,4 @@
-"""Only one file touches what is private in torch, and tests of what tgdsl expects of it."""
+"""Only one file touches torch's private parts, and these do what tgdsl expects."""
 
 import ast
 from pathlib import Path
