@@ -10,7 +10,7 @@ from tgdsl.testing import KindConformance
 class TestContact(KindConformance):
     kind = CONTACT
     is_differentiable = False
-    test_compiled_equals_eager = None  # its graph is part of another kind's
+    test_compiled_equals_eager = None  # part of another compiled graph
 
 
 class TestContactWithHysteresis(KindConformance):

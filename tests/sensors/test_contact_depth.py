@@ -10,7 +10,7 @@ from tgdsl.testing import KindConformance
 
 
 class TestContactDepth(KindConformance):
-    test_compiled_equals_eager = None  # its graph is part of the one of kinematic taxels
+    test_compiled_equals_eager = None  # kinematic taxels include its graph
     kind = CONTACT_DEPTH
 
 

@@ -100,7 +100,7 @@ def test_fingers_feel_each_other(tmp_path):
 
 @pytest.mark.parametrize("geom", HARD)
 def test_depth_follows_sizes(tmp_path, geom):
-    """Derivatives by an object's sizes are those of the readings, where the nearest point is unique."""
+    """Derivatives by an object's sizes match its readings, where the nearest point is unique."""
     rng = np.random.default_rng(4)
     touch = module(tmp_path, rng.normal(scale=0.012, size=(20, 3)) + 0.003, geom, kind="contact_depth")
     size = touch.constants["quantities/contact_depth/geoms/0/size"].clone()

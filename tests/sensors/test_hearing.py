@@ -81,7 +81,7 @@ def test_a_jump_without_a_reset_has_no_lasting_effect(build):
 
 
 def test_single_precision_hears_the_same_for_long(build):
-    """A kilometre from the origin: samples equal those of float64, within the resolution of a float32 clock."""
+    """A kilometre from the origin: samples match float64's, within the resolution of a float32 clock."""
     samples = [
         heard(
             build(dtype=dtype, tone={"frequency": 200.0}),

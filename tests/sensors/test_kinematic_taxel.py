@@ -20,13 +20,13 @@ from tgdsl.testing import KindConformance
 
 class TestKinematicTaxel(KindConformance):
     kind = KINEMATIC_TAXEL
-    test_compiled_equals_eager = None  # its graph is part of the one of all options
+    test_compiled_equals_eager = None  # `TestKinematicTaxelWithAllOptions` includes its graph
 
 
 class TestKinematicTaxelAsInThePaper(KindConformance):
     kind = KINEMATIC_TAXEL
     parameters = {"model": "paper", "outputs": ["force"]}
-    test_compiled_equals_eager = None  # its graph is part of the one of all options
+    test_compiled_equals_eager = None  # part of another compiled graph
 
 
 class TestKinematicTaxelWithAllOptions(KindConformance):
@@ -37,7 +37,7 @@ class TestKinematicTaxelWithAllOptions(KindConformance):
 class TestKinematicTaxelInTheCone(KindConformance):
     kind = KINEMATIC_TAXEL
     parameters = {"friction_cone": 0.2}
-    test_compiled_equals_eager = None  # its graph is part of the one of all options
+    test_compiled_equals_eager = None  # part of another compiled graph
 
 
 class TestKinematicTaxelOfALattice(KindConformance):
@@ -168,7 +168,7 @@ DRAGGED = {**ABOVE, "linvel": [0.1, -0.3, 0.2], "angvel": [0, 0, 2]}
 def test_balanced_taxels_press_with_the_solvers_force(model):
     """Normal forces sum to Σ f_c · m_c in the law's proportions; friction is the solver's where the law's is larger.
 
-    Flat on the box each of six taxels has a sixth: 0.5 N/6 of friction and, with its radius of 1 cm, a sixth of the torque.
+    Flat on the box each of six taxels has a sixth: 0.5 N/6 of friction, and its torque at the taxel's radius of 1 cm.
     """
     readings, plain = balanced(SIX, [[0.3, 0, -1.5], [0, 0.2, -0.5]], [[0, 0, -1]] * 2, DRAGGED, model=model)
     np.testing.assert_allclose(readings[:, 2].sum(), -2.0, rtol=1e-12)

@@ -15,7 +15,7 @@ from tgdsl.testing import KindConformance
 
 class TestLinkContact(KindConformance):
     kind = LINK_CONTACT
-    test_compiled_equals_eager = None  # its graph is part of the one of all outputs
+    test_compiled_equals_eager = None  # `TestLinkContactNormalForce` includes its graph
     is_differentiable = False
     gates = ()
 
@@ -57,7 +57,7 @@ class TestLinkContactNormalForceAlone(KindConformance):
     kind = LINK_CONTACT
     gates = ()
     parameters = {"outputs": ["normal_force"]}
-    test_compiled_equals_eager = None  # its graph is part of the one of all outputs
+    test_compiled_equals_eager = None  # `TestLinkContactNormalForce` includes its graph
 
     test_something_is_felt = TestLinkContact.test_something_is_felt
     test_a_broken_pose_is_seen = TestLinkContact.test_a_broken_pose_is_seen

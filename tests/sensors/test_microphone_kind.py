@@ -14,7 +14,7 @@ class TestMicrophone(KindConformance):
 
     kind = MICROPHONE
     num_envs = 12  # float32 errors are relative to the loudest one
-    test_compiled_equals_eager = None  # its graph is part of `TestMicrophoneBlock`'s
+    test_compiled_equals_eager = None  # `TestMicrophoneBlock` includes its graph
     parameters = {"body": "palm", "pos": [0.01, 0.0, 0.02], "speed": 9.0, "reach": 0.6, "nearest": 0.02, "falloff": 1.3}
     others = {"tone": (TONE, {"links": ["palm", "tip"], "frequency": 150.0, "samples": 20})}
     gates = ()

@@ -115,7 +115,7 @@ MODES = {
 
 @pytest.fixture(scope="module")
 def errors():
-    """Return a function of a mode that returns its errors by operation: one process for all of them."""
+    """Return a function from a mode to its errors by operation: one process runs all operations."""
 
     @cache
     def errors_of_mode(mode):

@@ -47,14 +47,14 @@ class TestProximityOverPointsAsInThePaper(KindConformance):
 class TestProximityOfOneRadius(KindConformance):
     kind = PROXIMITY
     parameters = {"tolerance": 0.1, "radius": 0.006}
-    test_compiled_equals_eager = None  # its graph equals that of `TestProximity`
+    test_compiled_equals_eager = None  # the same graph as `TestProximity`
     gates = ()
 
 
 class TestProximityAsInThePaper(KindConformance):
     kind = PROXIMITY
     parameters = {"tolerance": 0.1, "model": "paper", "outputs": ["force"], "reference_area": 0.01}
-    test_compiled_equals_eager = None  # its graph is part of another kind's
+    test_compiled_equals_eager = None  # part of another compiled graph
     gates = ()
 
 

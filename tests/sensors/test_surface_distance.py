@@ -10,7 +10,7 @@ class TestSurfaceDistance(KindConformance):
     kind = SURFACE_DISTANCE
     rest = 0.05
     gates = ()
-    test_compiled_equals_eager = None  # its graph is part of another kind's
+    test_compiled_equals_eager = None  # part of another compiled graph
 
 
 class TestSurfaceDistanceWithVectors(KindConformance):

@@ -24,7 +24,7 @@ COMMON = {"modes": MODES, "timestep": 0.002, "samples": 8, "scrape": 0.05}
 class TestSamples(KindConformance):
     kind = CONTACT_AUDIO
     test_taxel_permutation_commutes = None  # it reads no taxels
-    test_compiled_equals_eager = None  # `TestSubsteps` below has a graph that includes this one
+    test_compiled_equals_eager = None  # `TestSubsteps` includes its graph
     parameters = COMMON
     gates = ()
     num_steps = 4

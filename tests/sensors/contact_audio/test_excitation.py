@@ -66,7 +66,7 @@ def test_scraping_has_the_spectrum_of_the_modes(tmp_path):
 
 
 def test_scraping_differs_between_environments_whatever_their_number(tmp_path):
-    """Random numbers are counted: those of an environment do not depend on how many there are; a seed repeats them."""
+    """Random numbers are counted: they do not depend on the number of environments, and a seed repeats them."""
     force = np.full((5, 4), 2.0)
     four, two, again, other = (
         sound(plate(tmp_path).seed(seed), force[:, :count], 0.3) for seed, count in ((7, 4), (7, 2), (7, 4), (8, 4))

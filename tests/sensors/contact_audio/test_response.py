@@ -51,7 +51,7 @@ def test_energy_never_grows_unless_struck(tmp_path):
     while energies[-1] > 0 and len(energies) < 225:
         touch(silent)
         energies.append(energy(touch))
-    assert all(after < before for before, after in itertools.pairwise(energies))
+    assert all(current < previous for previous, current in itertools.pairwise(energies))
     assert energies[-1] == 0 and energies[-2] < 1e-22
 
 

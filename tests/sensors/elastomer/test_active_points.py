@@ -10,7 +10,7 @@ from tgdsl.sensors.elastomer import point_anchors
 from tgdsl.sensors.elastomer.point_anchors import Markers, ShearLoad, active_points, are_compacted, block_size
 
 FALLOFF, NUM_MARKERS, TAXELS = 2000.0, 11, ((6, 10), (0, 6), (10, 10))
-"""Markers of three links, one of which has none; the last marker belongs to no link."""
+"""Markers of three links, one without any; the last marker belongs to no link."""
 CASES = {
     # environments, points, share of active points in each environment in turn
     "few": (40, 500, (0.05, 0.2, 0.0)),

@@ -48,7 +48,7 @@ def to_dtype(stick_slip, dtype):
 
 
 def free_state(meeting):
-    """Return the state of points that hold nothing, after that of other objects' points."""
+    """Return the state of points that hold nothing, preceded by other objects' points."""
     num = meeting.source.pair.shape[0] * meeting.source.points[0].shape[2]
     return {name: torch.cat([torch.full((NUM_ENVS, BEFORE), 9.0), torch.zeros(NUM_ENVS, num)], dim=1) for name in PLANES}
 

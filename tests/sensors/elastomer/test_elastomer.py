@@ -29,7 +29,7 @@ class TestElastomerAsInThePaper(KindConformance):
     kind = ELASTOMER
     parameters = {"standoff": 0.003, "model": "paper", "normalize": "peak", "compressibility": 0.4, "anchors": "taxels"}
     gates = ("geometric",)
-    test_compiled_equals_eager = None  # its graph is part of another kind's
+    test_compiled_equals_eager = None  # part of another compiled graph
 
 
 class TestHalfSpace(KindConformance):
@@ -112,9 +112,9 @@ def test_lifting_ends_the_shear(tmp_path):
 def test_an_elastic_skin_has_no_traction_without_pressure(tmp_path):
     """Out of contact, within the band that keeps anchors, there is no traction; back in contact, the old anchor acts."""
     touch = module(tmp_path, PROBES, BALL, kind="elastomer", **ELASTIC)
-    before, above, after = (touch(state(touch, pos=[x, 0, z]))["s"] for x, z in ((0, 0.0095), (2e-4, 0.01005), (2e-4, 0.0095)))
+    initial, above, after = (touch(state(touch, pos=[x, 0, z]))["s"] for x, z in ((0, 0.0095), (2e-4, 0.01005), (2e-4, 0.0095)))
     assert not above.any()
-    assert before[0, 0, 0] == 0 and after[0, 0, 0] > 1e-6
+    assert initial[0, 0, 0] == 0 and after[0, 0, 0] > 1e-6
 
 
 def test_without_shear_there_is_neither_state_nor_frame(tmp_path):

@@ -40,7 +40,7 @@ class TestElastomerOnPoints(Creeping):
 
 
 class TestElastomerOnPointsAsInThePaper(Creeping):
-    test_compiled_equals_eager = None  # its graph is part of another kind's
+    test_compiled_equals_eager = None  # part of another compiled graph
     test_gradients_of_parameters_equal_finite_differences = None  # as for points above, and for the paper's model of taxels
     parameters = {"feels": ["item", "tool"], "points": 80, "model": "paper", "shear_strength": 200}
 

@@ -34,7 +34,7 @@ def document_of_two_links(folder, **sensor):
 
 
 def test_only_pairs_that_can_meet_have_state(tmp_path):
-    """Link b and the item never collide: with the gate they have no points. `explain` states what is remembered."""
+    """Link b and the item never collide: with the gate they have no points. `explain` states their memory."""
     touch = tgdsl.compile(document_of_two_links(tmp_path))
     assert {name: memory.shape for name, memory in touch.plan.sensors[0].state.items()} == dict.fromkeys(PLANES, (50,))
     text = touch.explain()

@@ -54,7 +54,7 @@ class TestForceTaxel(KindConformance):
 class TestForceTaxelWithPressure(KindConformance):
     kind = FORCE_TAXEL
     parameters = {"outputs": ["pressure", "force"], "footprint": 0.02, "moment_iterations": 2, "slots": 2}
-    test_compiled_equals_eager = None  # its graph is part of another kind's
+    test_compiled_equals_eager = None  # part of another compiled graph
     float64_tolerance = 1e-11
 
 
@@ -125,7 +125,7 @@ def test_a_contact_that_turns_around_an_edge_hands_its_force_over(tmp_path):
         total = forces[-1].sum(axis=0)
         np.testing.assert_allclose(total + readings["s/missed"][0, 0].numpy(), normal, atol=1e-15)
         assert (forces[-1] @ normal >= 0).all()
-    # Slope of the smooth step at most 3/2 · 2/0.75, that of the force's direction 1.
+    # The smooth step's slope is at most 3/2 · 2/0.75, the force direction's is 1.
     assert np.abs(np.diff(forces, axis=0)).max() <= 5 * np.pi / 2 / 75
 
 

@@ -34,9 +34,9 @@ def test_the_papers_blur_loses_force_at_edges_and_ours_does_not():
 
 def test_no_crosstalk_is_the_identity():
     """A taxel of strength 0 gives nothing, but receives from its neighbours."""
-    none, signal = {"crosstalk": {"strength": 0.0, "sigma": "1 mm"}}, np.array([[1.0], [2.0], [3.0]])
-    assert Noise(none, 3).lowered.terms == ()
-    more = Noise([none, BLUR, {}], 3).read(signal)[0, :, 0].numpy() - signal[:, 0]
+    off, signal = {"crosstalk": {"strength": 0.0, "sigma": "1 mm"}}, np.array([[1.0], [2.0], [3.0]])
+    assert Noise(off, 3).lowered.terms == ()
+    more = Noise([off, BLUR, {}], 3).read(signal)[0, :, 0].numpy() - signal[:, 0]
     assert more[0] > 0 and more[2] > 0
     np.testing.assert_allclose(more[0], more[2], rtol=1e-12)
     np.testing.assert_allclose(more.sum(), 0, atol=1e-15)

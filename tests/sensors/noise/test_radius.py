@@ -15,7 +15,7 @@ from tgdsl.testing.reference import full_scale_error
 
 
 def test_a_disturbed_radius_acts_like_another_radius(build, tmp_path):
-    """Depths equal exactly those of a module compiled with the drawn radii."""
+    """Depths match a module compiled with the drawn radii exactly."""
     touch = build(s={"kind": "contact_depth", "noise": {"radius_noise": 2e-3}})
     spec, drawn, num_felt = document(tmp_path, {"s": {"kind": "contact_depth"}}), [], 0
     for call in range(4):

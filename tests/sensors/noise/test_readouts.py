@@ -148,7 +148,7 @@ def test_explain_lists_the_stages_and_their_values(build):
 
 
 def test_explain_names_the_taxels_with_noise(build):
-    """With noise on named links: numbers are those of the noisy taxels, shares are percentages."""
+    """With noise on named links: numbers cover only the noisy taxels, shares are percentages."""
     noise = {"links": {"tip": {"gain": [0.9, 1.1], "white_noise": {"force": 0.25}, "dead_probability": 0.0005}}}
     touch = build(torch.float32, s={"noise": noise})
     num = int((touch.plan.layout.link_id == [link.name for link in touch.plan.layout.links].index("tip")).sum())

@@ -87,7 +87,7 @@ def test_a_module_disturbs_radii_first_and_holds_between_samples(tmp_path):
 
 @pytest.mark.parametrize("name", ["foo_x", "y", "ball_y_z"])
 def test_a_distance_is_named_by_its_object_whatever_the_names_end(tmp_path, name):
-    """An amplitude for `distance_foo_x` is not that of a component of `distance_foo`: module and definition agree."""
+    """`distance_foo_x` names no component of `distance_foo`: module and definition agree."""
     model = tmp_path / "pads.xml"
     model.write_text(PADS)
     points = [{"pos": [0, 0, 20 * MM], "normal": [0, 0, 1], "radius": "50 mm"}]

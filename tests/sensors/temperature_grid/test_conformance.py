@@ -21,7 +21,7 @@ class TestTemperatureGrid(KindConformance):
     parameters = {"cells": [3, 2, 2], "material": "copper", "emissivity": 0.5, "convection": 20.0}
     objects = HEAT
     test_taxel_permutation_commutes = None  # it reads no taxels
-    test_compiled_equals_eager = None  # its graph is part of `TestPerEnvironment`'s, or of that of all kinds
+    test_compiled_equals_eager = None  # `TestPerEnvironment` or `../test_compiled.py` includes its graph
 
     def document(self, scene, **changes):
         return {**super().document(scene, **changes), "objects": self.objects}

@@ -120,7 +120,7 @@ def test_peeking_changes_nothing_and_equals_the_next_reading(tmp_path):
 
 
 def test_samples_and_stacks_do_not_affect_temperatures(tmp_path):
-    """A sensor with a rate and a history holds its reading; its stored heat equals that of a plain one."""
+    """A sensor with a rate and a history holds its reading; its stored heat equals a plain sensor's."""
     plain = heat_module(tmp_path, TIP, SENSOR, OBJECTS)
     held = heat_module(tmp_path, TIP, {**SENSOR, "rate": "5 Hz", "history": 3}, OBJECTS)
     state, temperatures = touching(plain, 0.05), []

@@ -104,7 +104,7 @@ class Clamped(KindConformance):
     }  # fmt: skip
     gates = ("geometric",)
     test_taxel_permutation_commutes = None  # its taxels are on no pad
-    test_compiled_equals_eager = None  # its graph equals that of a pad with a free edge
+    test_compiled_equals_eager = None  # the same graph as a pad with a free edge
 
     @pytest.fixture
     def scene(self, tmp_path_factory):
@@ -168,8 +168,8 @@ def collocated(width, length, rate, bulk, displacement, places, nums):
     (x, slope_x), (y, slope_y) = chebyshev(nums[0], width), chebyshev(nums[1], length)
     eye_x, eye_y = np.eye(len(x)), np.eye(len(y))
     xx, yy, xy = np.kron(slope_x @ slope_x, eye_y), np.kron(eye_x, slope_y @ slope_y), np.kron(slope_x, slope_y)
-    apart = rate**2 * np.eye(len(xx)) - xx - yy
-    matrix = np.block([[apart - bulk * xx, -bulk * xy], [-bulk * xy, apart - bulk * yy]])
+    uncoupled = rate**2 * np.eye(len(xx)) - xx - yy
+    matrix = np.block([[uncoupled - bulk * xx, -bulk * xy], [-bulk * xy, uncoupled - bulk * yy]])
     at = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
     on_edge = np.tile((at[:, 0] % width == 0) | (at[:, 1] % length == 0), 2)
     u = np.where(on_edge, displacement(at).T.ravel(), 0.0)

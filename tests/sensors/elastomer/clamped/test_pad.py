@@ -161,9 +161,9 @@ def test_a_half_cylinder_unrolls_to_its_arc(cells):
     assert_frames(pad.edge_axes, pad.edge_normal)
     assert_frames(pad.taxel_axes, normal)
     arc = np.stack([-np.sin(angle), np.cos(angle), 0 * angle], axis=1)
-    got = np.einsum("nux,nx->nu", pad.taxel_axes, arc)
-    np.testing.assert_allclose(np.abs(got).max(axis=1), 1, atol=facet**2)
-    np.testing.assert_allclose(got, np.tile(got[0], (len(got), 1)), atol=facet)
+    components = np.einsum("nux,nx->nu", pad.taxel_axes, arc)
+    np.testing.assert_allclose(np.abs(components).max(axis=1), 1, atol=facet**2)
+    np.testing.assert_allclose(components, np.tile(components[0], (len(components), 1)), atol=facet)
     np.testing.assert_allclose(np.hypot(*pad.edge_pos[:, :2].T), radius, atol=radius * facet**2)
 
 
