@@ -1,4 +1,4 @@
-"""Readings of boxes: their places and colours by closed forms, what a terminal shows of them, and a picture."""
+"""Readings of boxes: positions and colours by closed forms, the table, and a picture."""
 
 import numpy as np
 import pytest
@@ -32,19 +32,19 @@ def build(tmp_path):
 
 
 def reading(touch, values):
-    """Return a reading whose second environment holds some values."""
-    one = torch.as_tensor(values, dtype=torch.float64)[:, None]
-    return {touch.outputs[0].name: torch.stack([torch.zeros_like(one), one])}
+    """Return a reading with values in its second environment and zeros in the first."""
+    values_per_box = torch.as_tensor(values, dtype=torch.float64)[:, None]
+    return {touch.outputs[0].name: torch.stack([torch.zeros_like(values_per_box), values_per_box])}
 
 
-def test_cells_lie_side_by_side_in_their_box(build):
+def test_cells_fill_their_box(build):
     touch, _ = build()
     rows = touch.rows["heat"]
     for link, sides in SIDES.items():
-        own = rows[rows["link"] == link]
-        np.testing.assert_allclose(own["size"], np.tile(np.array(sides) / [3, 2, 1], (6, 1)), atol=TOLERANCE)
-        expected = (own["cell"] + 0.5) * own["size"] - 0.5 * np.array(sides)
-        np.testing.assert_allclose(own["pos"], expected, atol=TOLERANCE)
+        cells = rows[rows["link"] == link]
+        np.testing.assert_allclose(cells["size"], np.tile(np.array(sides) / [3, 2, 1], (6, 1)), atol=TOLERANCE)
+        expected = (cells["cell"] + 0.5) * cells["size"] - 0.5 * np.array(sides)
+        np.testing.assert_allclose(cells["pos"], expected, atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("outputs", ["max", "mean"])
@@ -57,23 +57,23 @@ def test_a_whole_link_is_one_box(build, outputs):
 
 
 def test_a_point_has_the_colour_of_its_cell(build):
-    """Cell (i, j) of link a is at 20 + i + 10 j °C: at its middle, near its corners, and a little outside, in a turned body."""
+    """Cell (i, j) of link a is at 20 + i + 10 j °C: points in a turned body at its middle, near corners and slightly outside."""
     touch, sim = build()
     rows = touch.rows["heat"]
     values = np.where(rows["link"] == "a", 20.0 + rows["cell"][:, 0] + 10.0 * rows["cell"][:, 1], -7.0)
     boxes = boxes_of(touch, touch.outputs[0], reading(touch, values)["heat"], 1)
     assert (boxes.norm.vmin, boxes.norm.vmax) == (-7.0, 32.0)
     paint = boxes.painter(sim.model, POSE)
-    turn = Rotation.from_quat(POSE.quat[1], scalar_first=True)
-    for within in ([0, 0, 0], [0.49, -0.49, 0.49], [-0.49, 0.49, 0.7]):
-        at = rows["pos"][:6] + np.array(within) * rows["size"][:6]
-        found = paint(POSE.pos[1] + turn.apply(at), np.full(6, sim.model.body("a").id))
-        np.testing.assert_allclose(found, WARMTH(Normalize(-7, 32)(values[:6]))[:, :3], atol=TOLERANCE)
+    rotation = Rotation.from_quat(POSE.quat[1], scalar_first=True)
+    for offset in ([0, 0, 0], [0.49, -0.49, 0.49], [-0.49, 0.49, 0.7]):
+        points = rows["pos"][:6] + np.array(offset) * rows["size"][:6]
+        colours = paint(POSE.pos[1] + rotation.apply(points), np.full(6, sim.model.body("a").id))
+        np.testing.assert_allclose(colours, WARMTH(Normalize(-7, 32)(values[:6]))[:, :3], atol=TOLERANCE)
     assert np.isnan(paint(np.zeros((1, 3)), np.array([0]))).all()  # the world stays grey
 
 
-def test_cells_inside_are_not_seen(build):
-    """Of 4 × 3 × 3 cells two are inside; normals of what is exposed cancel over each link."""
+def test_inner_cells_are_not_drawn(build):
+    """Of 4 × 3 × 3 cells two are inside; normals of exposed faces cancel over each link."""
     touch, _ = build(cells=[4, 3, 3])
     boxes = boxes_of(touch, touch.outputs[0], reading(touch, np.arange(72.0))["heat"], 1)
     assert len(boxes.chosen) == 2 * (36 - 2)
@@ -82,16 +82,16 @@ def test_cells_inside_are_not_seen(build):
 
 
 @pytest.mark.parametrize(("values", "low", "high"), [([22.0] * 12, 21.5, 22.5), ([-5.0] + [40.0] * 11, -5, 40)])
-def test_the_range_of_the_colours(build, values, low, high):
+def test_colours_range_over_the_values_or_a_given_range(build, values, low, high):
     touch, _ = build()
-    given = reading(touch, values)["heat"]
-    norm = boxes_of(touch, touch.outputs[0], given, 1).norm
+    temperatures = reading(touch, values)["heat"]
+    norm = boxes_of(touch, touch.outputs[0], temperatures, 1).norm
     assert (norm.vmin, norm.vmax) == (low, high)
-    norm = boxes_of(touch, touch.outputs[0], given, 1, (0.0, 50.0)).norm
+    norm = boxes_of(touch, touch.outputs[0], temperatures, 1, (0.0, 50.0)).norm
     assert (norm.vmin, norm.vmax, norm(-5.0)) == (0.0, 50.0, 0.0)
 
 
-def test_the_picture_is_written_with_a_bar_in_degrees(build, tmp_path):
+def test_the_picture_has_a_colour_bar_in_degrees(build, tmp_path):
     touch, sim = build(outputs="surface", noise="clean")
     values = reading(touch, np.linspace(20, 45, 12))
     figure = overview_drawing(touch, sim, values, env=1, title="warm")

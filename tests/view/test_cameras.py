@@ -1,4 +1,4 @@
-"""From where a hand is seen, what counts as touched there, and what is summed: against MuJoCo's rays and sums by hand."""
+"""Cameras, touched taxels and sums of pictures, against MuJoCo's rays and sums by hand."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ FINGER = """
   </worldbody>
 </mujoco>
 """
-"""A fingertip whose taxels look at the palm behind which they are hidden."""
+"""A fingertip whose taxels face the palm, which hides them."""
 
 
 def finger(folder: Path, side: list[float]) -> tuple[tgdsl.TactileModule, BatchSimulation]:
@@ -49,8 +49,8 @@ def finger(folder: Path, side: list[float]) -> tuple[tgdsl.TactileModule, BatchS
     return touch, tgdsl.simulate(touch, 1)
 
 
-def in_view(sim: BatchSimulation, markers: Markers, camera: Camera) -> int:
-    """Return how many taxels MuJoCo's rays to the camera reach; the ball hides nothing."""
+def num_in_view(sim: BatchSimulation, markers: Markers, camera: Camera) -> int:
+    """Return how many taxels can see the camera, by MuJoCo's rays; the ball hides none."""
     state = mujoco.MjData(sim.model)
     mujoco.mj_forward(sim.model, state)
     ball, count = sim.model.body("ball").id, 0
@@ -61,7 +61,7 @@ def in_view(sim: BatchSimulation, markers: Markers, camera: Camera) -> int:
 
 
 def cameras(touch, sim) -> tuple[Markers, Camera, Camera]:
-    """Return the taxels, the camera that these face, and the one that is chosen."""
+    """Return the taxels, the camera that they face, and the chosen one."""
     state = sim.state()
     markers = markers_of(touch, sim, touch.outputs[0], touch(state)["depth"], 0)
     pose, palm = Pose(*sim.body_poses(0)), sim.model.body("palm").id
@@ -72,36 +72,38 @@ def cameras(touch, sim) -> tuple[Markers, Camera, Camera]:
 
 def test_a_fingertip_is_not_drawn_from_behind(tmp_path):
     touch, sim = finger(tmp_path, [1, 0, 0])
-    sim.batch.qpos[:, 1] += 0.5  # nothing is touched: all taxels count
+    sim.batch.qpos[:, 1] += 0.5  # nothing is touched, so all taxels count
     sim.step()
     markers, first, chosen = cameras(touch, sim)
-    assert in_view(sim, markers, first) == 0
+    assert num_in_view(sim, markers, first) == 0
     layout, pose = touch.plan.layout, Pose(*sim.body_poses(0))
-    most = max(in_view(sim, markers, camera_of(view, sim.model, [layout], pose, 1)) for view in VIEWS)
-    assert in_view(sim, markers, chosen) >= max(most, 1)
+    most = max(num_in_view(sim, markers, camera_of(view, sim.model, [layout], pose, 1)) for view in VIEWS)
+    assert num_in_view(sim, markers, chosen) >= max(most, 1)
 
 
-def test_a_view_that_shows_enough_is_kept(tmp_path):
+def test_a_camera_that_shows_enough_is_kept(tmp_path):
     touch, sim = finger(tmp_path, [-1, 0, 0])
     markers, first, chosen = cameras(touch, sim)
-    assert in_view(sim, markers, first) == len(markers.pos)
+    assert num_in_view(sim, markers, first) == len(markers.pos)
     for part, expected in zip(chosen, first, strict=True):
         np.testing.assert_array_equal(part, expected)
 
 
-def test_taxels_that_are_touched_count_first(tmp_path):
+def test_touched_taxels_take_precedence(tmp_path):
     touch, sim = finger(tmp_path, [1, 0, 0])
     sim.step()
     markers, _, chosen = cameras(touch, sim)
     assert 0 < markers.is_read.sum() < len(markers.pos)
-    own = Markers(*(getattr(markers, name)[markers.is_read] for name in ("pos", "normal", "size", "value")), "depth", "mm")
-    assert in_view(sim, own, chosen) == markers.is_read.sum()
+    touched_markers = Markers(
+        *(getattr(markers, name)[markers.is_read] for name in ("pos", "normal", "size", "value")), "depth", "mm"
+    )
+    assert num_in_view(sim, touched_markers, chosen) == markers.is_read.sum()
 
 
 @pytest.mark.parametrize(
     ("view", "angles"), [*VIEWS.items(), ("30,20", (30, 20)), ("-90, -90", (-90, -90)), ("1e2,0", (100, 0))]
 )
-def test_angles(view, angles):
+def test_views_have_angles(view, angles):
     assert angles_of(view) == angles
 
 
@@ -116,23 +118,23 @@ def test_angles(view, angles):
         ("1,2,3", 'there is no view "1,2,3"; expected azimuth and elevation in degrees, '),
     ],
 )
-def test_views_that_are_none(view, message):
+def test_invalid_views_are_refused(view, message):
     with pytest.raises(ViewError) as caught:
         angles_of(view)
     assert str(caught.value).startswith(message)
 
 
 def test_angles_turn_about_the_hand(tmp_path):
-    """By the definition: round the up axis from the mean normal, then up."""
+    """By definition: azimuth about the up axis from the mean normal, then elevation."""
     touch, sim = finger(tmp_path, [-1, 0, 0])
     layout, pose = touch.plan.layout, Pose(*sim.body_poses(0))
-    for around, rise in ((0, 0), (90, 0), (0, 90), (35, 20), (200, -40)):
-        toward = camera_of(f"{around},{rise}", sim.model, [layout], pose, 1).toward
-        a, r = np.radians([around, rise])
+    for azimuth, elevation in ((0, 0), (90, 0), (0, 90), (35, 20), (200, -40)):
+        toward = camera_of(f"{azimuth},{elevation}", sim.model, [layout], pose, 1).toward
+        a, r = np.radians([azimuth, elevation])
         np.testing.assert_allclose(toward, [np.cos(r) * np.cos(a), np.cos(r) * np.sin(a), np.sin(r)], atol=1e-9)
 
 
-# What is touched, and what is summed
+# Touched taxels and sums
 
 PAD = """
 <mujoco>
@@ -168,26 +170,26 @@ BIT = {"kind": "contact", "noise": {"white_noise": 0.001}}
 
 @pytest.mark.parametrize("more", [{}, {"readout": "both"}, {"rate": "100 Hz"}, {"history": 3}, {"sensor": BIT}])
 @pytest.mark.parametrize("env", [0, 1])
-def test_noise_is_not_touched(tmp_path, more, env):
-    """The cube's footprint by hand, in one environment; in the other one it hangs far above."""
+def test_noise_does_not_count_as_touch(tmp_path, more, env):
+    """The cube's footprint by hand in the first environment; in the second it is far above."""
     touch, sim = pad(tmp_path, **({} if "sensor" in more else {"noise": NOISE}), **more)
     sim.batch.qpos[1, 2] += 0.5
     *_, last = rollout(touch, sim, held_controls(sim.model, 0.02, sim.control_step))
     output = touch.outputs[0]
     before = {name: value.clone() for name, value in touch.state_dict().items()}
-    found = touched(touch, sim, output, last.readings, env)
+    is_touched = touched(touch, sim, output, last.readings, env)
     torch.testing.assert_close(dict(touch.state_dict()), before, rtol=0, atol=0)
     pos = touch.taxels["touch"]["pos"]
     # A probe's sphere of 4 mm reaches beyond the cube's sides by less than the distance to the next taxel.
     under = (np.abs(pos[:, 0] - 0.012) < 0.02) & (np.abs(pos[:, 1]) < 0.02)
     near = (np.abs(pos[:, 0] - 0.012) < 0.024) & (np.abs(pos[:, 1]) < 0.024)
-    assert found is not None
-    assert (found | ~under).all() if env == 0 else not found.any()
-    assert not (found & ~near).any()
-    assert markers_of(touch, sim, output, last.readings["touch"], env).is_read.sum() > found.sum()
+    assert is_touched is not None
+    assert (is_touched | ~under).all() if env == 0 else not is_touched.any()
+    assert not (is_touched & ~near).any()
+    assert markers_of(touch, sim, output, last.readings["touch"], env).is_read.sum() > is_touched.sum()
 
 
-def test_without_noise_what_reads_is_touched(tmp_path):
+def test_without_noise_every_active_taxel_is_touched(tmp_path):
     touch, sim = pad(tmp_path)
     sim.step()
     readings = touch(sim.state())
@@ -195,8 +197,8 @@ def test_without_noise_what_reads_is_touched(tmp_path):
     assert markers_of(touch, sim, touch.outputs[0], readings["touch"], 0).is_touched.any()
 
 
-def test_table_and_picture_sum_alike(tmp_path):
-    """Both say the length of the summed force, here with shear that cancels in part; the headline first says the sum of sizes."""
+def test_table_and_picture_agree_on_sums(tmp_path):
+    """Both give the norm of the summed force, with partly cancelling shear; the headline starts with the sum of norms."""
     touch, sim = pad(tmp_path)
     sim.step()
     force = torch.randn(2, 36, 3, generator=torch.Generator().manual_seed(1)).double() + torch.tensor([0, 0, -1.0])
@@ -210,7 +212,7 @@ def test_table_and_picture_sum_alike(tmp_path):
     assert small.summary().startswith(f"|Σ| {10 * expected:.3g} mN")
 
 
-def test_what_rounding_leaves_is_not_touched(tmp_path):
+def test_rounding_does_not_count_as_touch(tmp_path):
     touch, sim = pad(tmp_path)
     force = torch.zeros(2, 36, 3)
     force[0, :, 2] = torch.tensor([-2.0, 0.0011, 0.0009, 1e-7] * 9)
@@ -222,7 +224,7 @@ def test_what_rounding_leaves_is_not_touched(tmp_path):
 
 
 def test_opposed_forces_do_not_hide_the_load(tmp_path):
-    """36 forces of 0.5 N whose vector sum is what float32 leaves."""
+    """36 forces of 0.5 N whose vector sum is float32's rounding."""
     touch, sim = pad(tmp_path)
     force = torch.zeros(1, 36, 3)
     force[0, :, 0] = torch.tensor([0.5, -0.5] * 18)
@@ -245,7 +247,7 @@ GRIPPER = """
 """
 
 
-def test_a_hanging_gripper_hangs_and_shows_a_pad(tmp_path):
+def test_a_hanging_gripper_is_upright_and_shows_a_pad(tmp_path):
     (tmp_path / "gripper.xml").write_text(GRIPPER)
     grid = {"method": "grid", "rows": 4, "columns": 3, "radius": 0.004}
     links = {"left": {**grid, "direction": [1, 0, 0]}, "right": {**grid, "direction": [-1, 0, 0]}}
@@ -266,12 +268,12 @@ def test_a_hanging_gripper_hangs_and_shows_a_pad(tmp_path):
         best_camera(markers, hand, sim.model, touch.plan.layout, pose, base),
     ):
         assert camera.up[2] > 0.8
-        assert 0.4 < abs(camera.toward[0]) < 0.8  # along the normals: 0 is edge-on
-        assert in_view(sim, markers, camera) == 12  # all of one pad
+        assert 0.4 < abs(camera.toward[0]) < 0.8  # along the normals; 0 would be edge-on
+        assert num_in_view(sim, markers, camera) == 12  # all of one pad
 
 
 @pytest.mark.slow
-def test_run_draws_from_the_view_of_the_command_line(tmp_path, here):
+def test_run_draws_from_the_given_view(tmp_path, here):
     view = "-60,25"
     touch, sim = pad(tmp_path, noise=NOISE)
     sim.step()
@@ -285,6 +287,6 @@ def test_run_draws_from_the_view_of_the_command_line(tmp_path, here):
     assert code == 0, error
 
 
-def test_run_looks_at_the_view_first(tmp_path, here):
+def test_run_checks_the_view_first(tmp_path, here):
     code, _, error = here(tmp_path, "run", "none.yaml", "--view", "bak")
     assert (code, error) == (2, 'tgdsl: there is no view "bak"; did you mean "back"?\n')

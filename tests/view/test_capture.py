@@ -1,4 +1,4 @@
-"""Pictures and videos of a browser's view, of a client that draws as viser's do."""
+"""Pictures and videos of a browser's view, with a client that renders like viser's."""
 
 import io
 import threading
@@ -27,7 +27,7 @@ class Client:
         self.files.append((filename, content))
 
 
-def test_a_picture_has_the_pixels_of_the_window():
+def test_a_picture_has_the_size_of_the_window():
     client = Client()
     send_picture(client)
     ((name, content),) = client.files
@@ -37,7 +37,7 @@ def test_a_picture_has_the_pixels_of_the_window():
         assert image.getpixel((5, 5)) == (10, 10, 10)
 
 
-def test_a_video_plays_as_long_as_it_was_recorded_and_ends_where_the_browser_goes():
+def test_a_video_plays_in_real_time_and_ends_when_the_browser_disconnects():
     client = Client(num_frames=4)
     begin = time.monotonic()
     video = record(client, threading.Event())
@@ -54,7 +54,7 @@ def test_a_video_plays_as_long_as_it_was_recorded_and_ends_where_the_browser_goe
     assert 0.3 < duration <= recorded + 0.15  # four frames, 0.1 s apart at least
 
 
-def test_a_browser_that_is_gone_at_once_gives_no_video():
+def test_a_browser_that_disconnects_at_once_gives_no_video():
     assert record(Client(num_frames=0), threading.Event()) is None
 
 

@@ -1,4 +1,4 @@
-"""Pictures of taxels that cannot feel: they are crossed out, and counted in the legend."""
+"""Taxels that cannot feel are crossed out in pictures and counted in the legend."""
 
 from pathlib import Path
 
@@ -30,17 +30,17 @@ def hand(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
 
 def marks(axes: Axes, which: str) -> np.ndarray:
     """Return the middle of each disc, in pixels of the panel."""
-    found = next(part for part in axes.collections if part.get_gid() == which)
-    return np.array([np.asarray(path.vertices[:24]).mean(axis=0) for path in found.get_paths()])
+    collection = next(part for part in axes.collections if part.get_gid() == which)
+    return np.array([np.asarray(path.vertices[:24]).mean(axis=0) for path in collection.get_paths()])
 
 
 def test_taxels_that_cannot_feel_are_crossed_out(hand: Drawn) -> None:
-    """Two bars per taxel, which cross at its disc's middle: in full colour in view, faint where hidden; the legend counts them."""
+    """Two bars per taxel cross at its disc's centre, opaque if visible, faint if hidden; the legend counts them."""
     model, layouts = hand
     layout = layouts["many"]
     palm, finger = layout.taxels_of(("palm",)), layout.taxels_of(("finger",))
     records = (Unfelt("palm", BURIED, "", palm[:5], len(palm)), Unfelt("finger", COVERED, "", finger[:2], len(finger)))
-    plain, crossed = (drawing(model, layouts, size=SMALL, unfelt=own) for own in (None, {"many": records}))
+    plain, crossed = (drawing(model, layouts, size=SMALL, unfelt=unfelt) for unfelt in (None, {"many": records}))
     few, many = crossed.axes
     assert [part.get_gid() for part in few.collections] == [part.get_gid() for part in plain.axes[0].collections]
     bars = next(part for part in many.collections if part.get_gid() == "unfelt")
@@ -49,9 +49,9 @@ def test_taxels_that_cannot_feel_are_crossed_out(hand: Drawn) -> None:
     middles = np.concatenate([marks(many, name).reshape(-1, 2) for name in ("shown", "hidden")])
     first, second = segments[:, 0].mean(axis=1), segments[:, 1].mean(axis=1)
     np.testing.assert_allclose(first, second, atol=1e-6)
-    apart = np.linalg.norm(first[:, None] - middles[None], axis=2)
-    assert (apart.min(axis=1) < 0.05).all() and len(set(apart.argmin(axis=1))) == 7
-    is_shown = apart.argmin(axis=1) < len(marks(many, "shown"))
+    distances = np.linalg.norm(first[:, None] - middles[None], axis=2)
+    assert (distances.min(axis=1) < 0.05).all() and len(set(distances.argmin(axis=1))) == 7
+    is_shown = distances.argmin(axis=1) < len(marks(many, "shown"))
     np.testing.assert_allclose(np.asarray(bars.get_colors())[:, 3], np.repeat(np.where(is_shown, 1.0, 0.3), 2))
     legends = [[text.get_text() for text in axes.get_legend().get_texts()] for axes in crossed.axes]
     assert legends[1][-1] == "cannot feel 7" and legends[1][:-1] == [
@@ -60,7 +60,7 @@ def test_taxels_that_cannot_feel_are_crossed_out(hand: Drawn) -> None:
     assert not any("feel" in text for text in legends[0])
 
 
-def test_the_file_has_red_pixels_only_where_something_is_crossed_out(hand: Drawn, tmp_path: Path) -> None:
+def test_the_file_has_red_pixels_only_in_crossed_out_panels(hand: Drawn, tmp_path: Path) -> None:
     model, layouts = hand
     taxels = np.arange(36)
     for name, unfelt in (("plain", {}), ("crossed", {"many": (Unfelt("palm", BURIED, "", taxels, 36),)})):

@@ -1,4 +1,4 @@
-"""The page of `tgdsl layout new --view`: its controls change the layout, and its button writes the file of the command."""
+"""The page of `tgdsl layout new --view`: controls change the layout, and a button writes the command's file."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,7 +30,7 @@ def discs(page: LayoutPage) -> dict[str, int]:
     return {name: len(handle.batched_positions) for name, (_, handle) in page._discs.items()}
 
 
-def test_controls_change_the_chosen_links_and_the_button_writes_the_file_of_the_command(tmp_path):
+def test_controls_change_the_chosen_links_and_the_button_writes_the_commands_file(tmp_path):
     with opened(tmp_path) as page:
         before = {name: handle for name, (_, handle) in page._discs.items()}
         page.chosen.value = "(tips)"
@@ -38,7 +38,7 @@ def test_controls_change_the_chosen_links_and_the_button_writes_the_file_of_the_
         page.density.value = 10.0
         page.react()
         assert {name: num for name, num in discs(page).items() if "tip" in name} == {"left_tip": 48, "right_tip": 48}
-        assert page._discs["palm"][1] is before["palm"]  # what has not changed is not drawn again
+        assert page._discs["palm"][1] is before["palm"]  # unchanged links are not drawn again
         assert {tuple(page._discs[name][1].batched_colors[0]) for name in ("left", "left_tip")} == {LIVE_REST, CHOSEN}
         page.chosen.value = "(all)"
         page.react()
@@ -76,7 +76,7 @@ def test_side_box_and_resolution_move_the_taxels(tmp_path):
         )
 
 
-def test_links_leave_and_join_groups(tmp_path):
+def test_links_can_leave_and_join_groups(tmp_path):
     with opened(tmp_path) as page:
         page.members["tips"]["left_tip"].value = False
         page.members["tips"]["palm"].value = True
@@ -91,7 +91,7 @@ def test_links_leave_and_join_groups(tmp_path):
         assert page.side.value == ALL_AROUND
 
 
-def test_a_mistaken_value_is_shown_and_nothing_is_written_until_it_is_mended(tmp_path):
+def test_an_invalid_value_is_shown_and_blocks_writing(tmp_path):
     with opened(tmp_path) as page:
         num = sum(discs(page).values())
         page.density.value = 0.0
@@ -107,10 +107,10 @@ def test_a_mistaken_value_is_shown_and_nothing_is_written_until_it_is_mended(tmp
         assert page.out.exists()
 
 
-def test_a_file_of_someone_else_is_not_replaced(tmp_path):
+def test_a_foreign_file_is_replaced_only_with_force(tmp_path):
     with opened(tmp_path) as page:
         page._write()
-        page._write()  # its own is
+        page._write()  # its own file is replaced
         page.out.write_text("mine")
         page._write()
         assert "this file is there already; give --force to replace it" in page.problem.content

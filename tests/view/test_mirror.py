@@ -1,4 +1,4 @@
-"""The page in a process of its own: what it is sent, when, and what happens to the loop if it ends."""
+"""The page in its own process: frames, when they are sent, and a loop that outlives it."""
 
 import os
 import pickle
@@ -19,7 +19,7 @@ from tgdsl.view.stages import SimStage
 
 
 def answer(stage: SimStage, requests, frames) -> None:
-    """Answer requests for frames, as a loop does, until there are no more."""
+    """Answer requests for frames, like a loop, until they end."""
     try:
         while True:
             frame = mirror.frame_of(stage, pickle.load(requests), b"")
@@ -30,7 +30,7 @@ def answer(stage: SimStage, requests, frames) -> None:
 
 
 def close(copy: MirrorStage, sent, *others) -> None:
-    """Close pipes, that of the frames first: then the mirror reads no more."""
+    """Close pipes, first the one of the frames, so that the mirror stops reading."""
     sent.close()
     while not copy.is_over:
         time.sleep(0.01)
@@ -38,21 +38,21 @@ def close(copy: MirrorStage, sent, *others) -> None:
         end.close()
 
 
-def test_a_mirror_has_the_poses_and_readings_of_the_environment_that_is_asked_for(document):
+def test_a_mirror_has_the_poses_and_readings_of_the_requested_environment(document):
     touch = tgdsl.compile(document)
     sim = tgdsl.simulate(touch, num_envs=3)
     lift = np.array([[0.0], [0.01], [-0.002]])
     sim.reset(qpos=lift)
     stage = SimStage(touch, sim)
     stage.update(touch(sim.state()))
-    (requests, asked), (frames, sent) = (map(open, os.pipe(), ("rb", "wb")) for _ in range(2))
+    (requests, request_pipe), (frames, frame_pipe) = (map(open, os.pipe(), ("rb", "wb")) for _ in range(2))
     opening = mirror._Opening(mirror._tables(touch), stage.model, 3, mirror.frame_of(stage, 0, b""), "127.0.0.1", 0)
-    copy = MirrorStage(pickle.loads(pickle.dumps(opening)), frames, asked)
-    thread = threading.Thread(target=answer, args=(stage, requests, sent))
+    copy = MirrorStage(pickle.loads(pickle.dumps(opening)), frames, request_pipe)
+    thread = threading.Thread(target=answer, args=(stage, requests, frame_pipe))
     thread.start()
     for env in (1, 0, 2):
         copy.body_poses(env)
-        assert copy.readings == {}  # until a frame of this environment has come
+        assert copy.readings == {}  # until a frame of this environment arrives
         while not copy.readings:
             time.sleep(0.001)
             copy.advance()
@@ -65,38 +65,38 @@ def test_a_mirror_has_the_poses_and_readings_of_the_environment_that_is_asked_fo
         np.testing.assert_array_equal(contacts.pos, expected.pos)
     assert float(copy.readings["touch"].norm()) > 0
     assert copy.time == stage.time
-    asked.close()
+    request_pipe.close()
     thread.join()
-    close(copy, sent, requests, frames)
+    close(copy, frame_pipe, requests, frames)
 
 
-def test_the_model_of_an_object_that_differs_is_sent_once(document):
-    own = document.with_name("variants.yaml")
+def test_the_model_of_a_different_object_is_sent_once(document):
+    variants = document.with_name("variants.yaml")
     shapes = "variants: [{type: sphere, size: [20 mm], density: 600}, {type: sphere, size: [15 mm], density: 600}]"
-    own.write_text(WITHOUT_PROXIMITY.replace("{body: ball}", f"{{body: ball, {shapes}}}"))
-    touch = tgdsl.compile(own)
+    variants.write_text(WITHOUT_PROXIMITY.replace("{body: ball}", f"{{body: ball, {shapes}}}"))
+    touch = tgdsl.compile(variants)
     stage = SimStage(touch, tgdsl.simulate(touch, num_envs=2))
-    there = mirror.shapes_of(stage.env_model(0))
-    assert mirror.frame_of(stage, 0, there).model is None
-    model = mirror.frame_of(stage, 1, there).model
+    known_shapes = mirror.shapes_of(stage.env_model(0))
+    assert mirror.frame_of(stage, 0, known_shapes).model is None
+    model = mirror.frame_of(stage, 1, known_shapes).model
     assert model is not None
     radius = pickle.loads(pickle.dumps(model)).geom("tgdsl/ball/0").size[0]
     assert radius == pytest.approx(0.015)
     assert mirror.frame_of(stage, 1, mirror.shapes_of(model)).model is None
 
 
-def test_another_environment_of_a_loop_that_stands_still_is_not_drawn(document):
+def test_another_environment_of_a_halted_loop_is_not_drawn(document):
     touch = tgdsl.compile(document)
     stage = SimStage(touch, tgdsl.simulate(touch, num_envs=2))
     stage.update(touch(stage.sim.state()))
-    (requests, asked), (frames, sent) = (map(open, os.pipe(), ("rb", "wb")) for _ in range(2))
+    (requests, request_pipe), (frames, frame_pipe) = (map(open, os.pipe(), ("rb", "wb")) for _ in range(2))
     opening = mirror._Opening(mirror._tables(touch), stage.model, 2, mirror.frame_of(stage, 0, b""), "127.0.0.1", 0)
-    copy = MirrorStage(opening, frames, asked)
+    copy = MirrorStage(opening, frames, request_pipe)
     copy.body_poses(1)
     copy.advance()
     copy.body_poses(1)
     assert copy.readings == {}
-    close(copy, sent, asked, requests, frames)
+    close(copy, frame_pipe, request_pipe, requests, frames)
 
 
 def test_a_stage_with_nothing_to_draw_is_refused(document):
@@ -114,19 +114,19 @@ def test_a_loop_sends_frames_while_a_browser_is_connected_and_outlives_the_page(
     page = tgdsl.show(touch, sim, port=8350)
 
     def loop(seconds: float, is_over: Callable[[], bool] = lambda: False) -> int:
-        begin, before = time.monotonic(), page.num_frames
+        begin, num_before = time.monotonic(), page.num_frames
         while time.monotonic() - begin < seconds and not is_over():
             sim.step()
             page.update(touch(sim.state()))
             time.sleep(0.002)
-        return page.num_frames - before
+        return page.num_frames - num_before
 
     assert loop(0.5) == 0
     for _ in range(2):  # closed and opened again
         with silent_browser(page.url):
-            before = page.num_frames
-            loop(60.0, lambda before=before: page.num_frames > before + 2)
-            assert page.num_frames > before + 2
+            num_before = page.num_frames
+            loop(60.0, lambda num_before=num_before: page.num_frames > num_before + 2)
+            assert page.num_frames > num_before + 2
             assert loop(1.0) <= 31  # 30 per second
         loop(60.0, lambda: loop(1.0) == 0)
         assert loop(0.5) == 0

@@ -1,4 +1,4 @@
-"""The overview: a panel per reading, arrows along the vectors that were read, bodies amid their taxels."""
+"""The overview: a panel per reading, with arrows along vectors."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def scene(tmp_path):
     return touch, tgdsl.simulate(touch, 2)
 
 
-def test_arrows_are_the_vectors_in_the_plane_of_the_picture(scene):
+def test_arrows_are_the_projected_vectors(scene):
     touch, sim = scene
     rng = np.random.default_rng(0)
     force = rng.normal(size=(2, 6, 3)) * [1, 1, 0]  # in the plane of the pad
@@ -51,15 +51,15 @@ def test_arrows_are_the_vectors_in_the_plane_of_the_picture(scene):
     markers = markers_of(touch, sim, touch.outputs[0], readings["force"], 1)
     world = Rotation.from_euler("XYZ", [20, 30, 40], degrees=True).apply(force[1])
     np.testing.assert_allclose(markers.vector, world, atol=1e-12)
-    # Pixels are a linear map of the plane of the pad: fit it to the taxels' places, and apply it to the vectors.
-    read = np.arange(6) != 4
-    at, drawn = np.column_stack([arrows.X, arrows.Y]), np.column_stack([arrows.U, arrows.V])
-    to_pixels = np.linalg.lstsq(np.column_stack([markers.pos[read], np.ones(5)]), at, rcond=None)[0][:3]
-    expected = world[read] @ to_pixels
+    # Pixels are a linear map of the pad's plane: fit it to the taxels' positions, and apply it to the vectors.
+    is_read = np.arange(6) != 4
+    positions, drawn = np.column_stack([arrows.X, arrows.Y]), np.column_stack([arrows.U, arrows.V])
+    to_pixels = np.linalg.lstsq(np.column_stack([markers.pos[is_read], np.ones(5)]), positions, rcond=None)[0][:3]
+    expected = world[is_read] @ to_pixels
     np.testing.assert_allclose(drawn / np.linalg.norm(drawn), expected / np.linalg.norm(expected), atol=1e-9)
 
 
-def test_each_panel_that_reads_has_a_colour_bar(scene):
+def test_each_active_panel_has_a_colour_bar(scene):
     touch, sim = scene
     readings = {"force": torch.full((2, 6, 3), 2e-7), "depth": torch.full((2, 6, 1), 3e-3)}
     force, depth = drawing(touch, sim, readings).axes[:2]
@@ -70,7 +70,7 @@ def test_each_panel_that_reads_has_a_colour_bar(scene):
     np.testing.assert_allclose(bar.get_xlim(), (0, 3), rtol=1e-6)
 
 
-def test_what_cannot_be_drawn(scene, tmp_path):
+def test_a_missing_environment_or_reading_is_refused(scene, tmp_path):
     touch, sim = scene
     with pytest.raises(ViewError, match="environment 2 does not exist, expected 0 to 1"):
         overview(touch, sim, touch(sim.state()), tmp_path / "a.png", env=2)

@@ -1,4 +1,4 @@
-"""The live page: what its handles are set to, and, in a real browser, what is seen and what its controls do."""
+"""The live page: values of its handles, and in a real browser what it shows and what its controls do."""
 
 import io
 import re
@@ -45,7 +45,7 @@ from tgdsl.view.stages import RunStage, SceneStage, Stage
 
 ROOT = Path(__file__).parents[2]
 TWO_BALLS = "variants: [{type: sphere, size: [20 mm], density: 6000}, {type: sphere, size: [15 mm], density: 6000}]"
-"""Shapes of an object in the even and in the odd environments."""
+"""Shapes of an object in even and odd environments."""
 
 
 @contextmanager
@@ -59,7 +59,7 @@ def opened(stage: Stage) -> Iterator[Page]:
 
 
 def disc_of(page: Page):
-    """Return the discs of the chosen reading's only link."""
+    """Return the discs of the chosen reading, which has one link."""
     ((handle, _, _),) = page.scene.layers[0].members
     return handle
 
@@ -70,14 +70,14 @@ def test_discs_are_at_the_taxels_in_the_frame_of_their_body(document):
         table, model = touch.taxels["touch"], page.stage.model
         (body,) = {model.body(name).id for name in table["body"]}
         disc = disc_of(page)
-        apart = np.linalg.norm(disc.batched_positions - table["pos"], axis=1)
-        assert apart.max() < 3e-4  # lifted off the surface
-        turned = Rotation.from_quat(disc.batched_wxyzs, scalar_first=True).apply([0, 0, 1])
-        np.testing.assert_allclose(turned, table["normal"], atol=1e-6)
+        distances = np.linalg.norm(disc.batched_positions - table["pos"], axis=1)
+        assert distances.max() < 3e-4  # lifted off the surface
+        normals = Rotation.from_quat(disc.batched_wxyzs, scalar_first=True).apply([0, 0, 1])
+        np.testing.assert_allclose(normals, table["normal"], atol=1e-6)
         np.testing.assert_allclose(page.scene.frames[body].position, model.body("pad").pos, atol=1e-9)
 
 
-def test_the_most_pressed_taxel_has_the_hottest_colour_and_its_reading_is_written(document):
+def test_the_most_pressed_taxel_has_the_hottest_colour_and_its_reading_is_shown(document):
     touch = tgdsl.compile(document)
     with opened(SceneStage(touch)) as page:
         for _ in range(100):
@@ -85,15 +85,15 @@ def test_the_most_pressed_taxel_has_the_hottest_colour_and_its_reading_is_writte
         page.draw()
         force = page.stage.readings["touch"][0].norm(dim=-1)
         disc = disc_of(page)
-        most = int(force.argmax())
-        assert force[most] > 0.01
+        hottest = int(force.argmax())
+        assert force[hottest] > 0.01
         blue = disc.batched_colors[:, 2].astype(int)
-        assert blue[most] == blue[force.numpy() > 0].min()
-        page._pick(most)
+        assert blue[hottest] == blue[force.numpy() > 0].min()
+        page._pick(hottest)
         page.draw()
-        assert f"taxel {most}" in page.panel.value.content
-        shown = float(re.search(r"([\d.e-]+) N", page.panel.value.content)[1])
-        assert shown == pytest.approx(float(force[most]), rel=1e-3)
+        assert f"taxel {hottest}" in page.panel.value.content
+        value = float(re.search(r"([\d.e-]+) N", page.panel.value.content)[1])
+        assert value == pytest.approx(float(force[hottest]), rel=1e-3)
 
 
 def test_a_slider_moves_its_actuator_and_a_keyframe_moves_the_sliders(document):
@@ -119,7 +119,7 @@ def test_another_reading_has_its_own_channels(document):
         assert page.panel.channel.value == "magnitude"
 
 
-def test_a_page_is_served_to_this_machine_unless_another_address_is_named(document):
+def test_a_page_is_served_only_locally_by_default(document):
     touch = tgdsl.compile(document)
     with opened(SceneStage(touch)) as page, pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.2", page.server.get_port()))
@@ -130,14 +130,14 @@ def test_a_page_is_served_to_this_machine_unless_another_address_is_named(docume
     page.stage.close()
 
 
-def test_a_choice_has_no_option_twice(document):
-    """A browser refuses to show such a page; the document has a group named "all"."""
+def test_dropdowns_have_no_duplicate_options(document):
+    """A browser would refuse such a page; the document has a group named "all"."""
     with opened(SceneStage(tgdsl.compile(document))) as page:
         for dropdown in (page.panel.group, page.panel.plotted, page.panel.reading, page.panel.channel):
             assert len(dropdown.options) == len(set(dropdown.options))
 
 
-def test_pause_stops_and_step_once_makes_one_step(document):
+def test_pause_stops_and_step_once_takes_one_step(document):
     touch = tgdsl.compile(document)
     with opened(SceneStage(touch)) as page:
         page.panel.paused.value = True
@@ -156,7 +156,7 @@ def recording(document, tmp_path_factory) -> Path:
     return folder / "readings.npz"
 
 
-def test_a_recorded_run_is_where_mujoco_had_it(document, recording):
+def test_a_recorded_run_has_mujocos_poses(document, recording):
     touch = tgdsl.compile(document)
     stage = RunStage(touch, recording)
     with np.load(recording) as arrays:
@@ -181,14 +181,14 @@ def test_a_recorded_run_is_where_mujoco_had_it(document, recording):
         assert page.panel.instant.value == 3
 
 
-def test_a_run_of_another_document_is_refused_by_name(document, recording):
+def test_a_run_of_another_document_is_refused_with_the_reading(document, recording):
     other = document.with_name("other.yaml")
     other.write_text(DOCUMENT.replace("near:", "close:"))
     with pytest.raises(SimulationError, match=r'no reading "close"'):
         RunStage(tgdsl.compile(other), recording)
 
 
-def test_what_is_no_run_is_refused_with_what_it_lacks(tmp_path):
+def test_a_file_that_is_not_a_run_is_refused_with_the_missing_array(tmp_path):
     np.savez(tmp_path / "log.npz", time=np.zeros(3))
     with pytest.raises(SimulationError, match="it has no `qpos`"):
         View(tmp_path / "log.npz")._stage()
@@ -203,7 +203,7 @@ def test_another_stage_replaces_the_discs(document):
         assert len(disc_of(page).batched_positions) == len(first.batched_positions)
 
 
-def test_a_stage_with_nothing_to_draw_is_a_problem_and_the_one_before_stays(document):
+def test_a_stage_with_nothing_to_draw_keeps_the_previous_one_and_shows_a_problem(document):
     bare = document.with_name("bare.yaml")
     bare.write_text(DOCUMENT.split("sensors:")[0] + "sensors:\n  hum: {kind: actuation_audio, samples: 32, substeps: 5}\n")
     silent = SceneStage(tgdsl.compile(bare))
@@ -222,7 +222,7 @@ def test_a_policy_needs_a_task(document):
         View(document, policy=Path("policy.pt"))._stage()
 
 
-def test_what_is_saved_is_shown_and_mistakes_have_their_line(document):
+def test_a_saved_document_is_shown_and_mistakes_have_their_line(document):
     command = View(document)
     watch = command._watch()
     assert watch() is None
@@ -239,14 +239,14 @@ def test_what_is_saved_is_shown_and_mistakes_have_their_line(document):
     document.write_text(DOCUMENT)
 
 
-def test_a_layout_that_is_saved_is_shown(document):
+def test_a_saved_layout_is_shown(document):
     whole = yaml.safe_load(DOCUMENT)
     layout = document.with_name("layout.yaml")
     layout.write_text(yaml.safe_dump({"tgdsl": 1, **whole["robot"]["layout"]}))
     whole["robot"]["layout"] = layout.name
-    own = document.with_name("own.yaml")
-    own.write_text(yaml.safe_dump(whole))
-    watch = View(own)._watch()
+    file = document.with_name("own.yaml")
+    file.write_text(yaml.safe_dump(whole))
+    watch = View(file)._watch()
     assert watch() is None
     layout.write_text(layout.read_text().replace("rows: 4", "rows: 5"))
     stage = watch()
@@ -255,13 +255,13 @@ def test_a_layout_that_is_saved_is_shown(document):
     layout.write_text(layout.read_text().replace("rows: 5", "rows: five"))
     problem = watch()
     assert isinstance(problem, str) and "layout.yaml" in problem
-    own.write_text(f"{own.read_text()}\nnotes: {'a text that is no name of a file ' * 20}\n")
+    file.write_text(f"{file.read_text()}\nnotes: {'a text that is no name of a file ' * 20}\n")
     assert "notes" in str(watch())
-    own.unlink()  # an editor replaces it
+    file.unlink()  # an editor replaces it
     assert watch() is None
 
 
-def test_the_plot_begins_again_when_another_environment_is_chosen(document):
+def test_choosing_another_environment_restarts_the_plot(document):
     with opened(SceneStage(tgdsl.compile(document), num_envs=2)) as page:
         page.run(seconds=0.3)
         assert len(page._history) > 1
@@ -272,7 +272,7 @@ def test_the_plot_begins_again_when_another_environment_is_chosen(document):
         assert len(page._history) == 1
 
 
-def test_frames_are_saved_as_they_were_drawn(document):
+def test_saved_frames_match_the_drawn_ones(document):
     touch = tgdsl.compile(document)
     with opened(SceneStage(touch, num_envs=2)) as page:
         assert page.panel.env is not None
@@ -288,20 +288,20 @@ def test_frames_are_saved_as_they_were_drawn(document):
         with np.load(io.BytesIO(page.saved_frames()), allow_pickle=False) as arrays:
             for name in expected[0]:
                 np.testing.assert_array_equal(arrays[name][-3:], np.stack([frame[name] for frame in expected]))
-            assert len(arrays["time"]) == 4  # the first frame is that of the start
+            assert len(arrays["time"]) == 4  # the first frame is the start
 
 
-# What is drawn, and switches ---------------------------------------------------------------------------------------------------
+# Drawing and switches ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_contact_is_below_the_ball_and_carries_what_its_actuator_does_not(document):
+def test_the_contact_is_below_the_ball_and_balances_weight_and_actuator(document):
     stage = SceneStage(tgdsl.compile(document), num_envs=2)
     for _ in range(200):
         stage.advance()
     ball, weight, stiffness = stage.model.body("ball"), 0.2 * 9.81, 400.0
     for env in (0, 1):
         contacts = stage.contacts(env)
-        np.testing.assert_allclose(contacts.pos, [[0.01, 0, 0.055]], atol=5e-4)  # half of how deep the ball is in
+        np.testing.assert_allclose(contacts.pos, [[0.01, 0, 0.055]], atol=5e-4)  # half the ball's penetration
         normal_force = weight + stiffness * float(stage.sim.qpos[env, 0])  # the actuator's target is 0
         on_pad = contacts.forces_on(frozenset({stage.model.body("pad").id}))
         np.testing.assert_allclose(on_pad, [[0, 0, -normal_force]], rtol=1e-3, atol=1e-6)
@@ -309,7 +309,7 @@ def test_a_contact_is_below_the_ball_and_carries_what_its_actuator_does_not(docu
     stage.close()
 
 
-def test_contacts_are_drawn_and_switched_off(document):
+def test_contacts_are_drawn_and_can_be_switched_off(document):
     with opened(SceneStage(tgdsl.compile(document))) as page:
         for _ in range(100):
             page.stage.advance()
@@ -327,7 +327,7 @@ def test_contacts_are_drawn_and_switched_off(document):
         assert not page.scene._forces.visible
 
 
-def test_links_groups_and_sensors_are_switched_on_and_off(tmp_path):
+def test_links_groups_and_sensors_can_be_switched_on_and_off(tmp_path):
     side = '<body name="side" pos="0 .1 .05"><geom name="side" type="box" size=".02 .02 .005"/></body>'
     (tmp_path / "press.xml").write_text(SCENE.replace('<body name="ball"', f'{side}<body name="ball"'))
     grid = "{method: grid, rows: 2, columns: 2, direction: [0, 0, -1], radius: 6 mm}"
@@ -335,21 +335,21 @@ def test_links_groups_and_sensors_are_switched_on_and_off(tmp_path):
     (tmp_path / "press.yaml").write_text(text)
     with opened(SceneStage(tgdsl.compile(tmp_path / "press.yaml"))) as page:
 
-        def shown() -> set[str]:
+        def visible_links() -> set[str]:
             page._react()
             page.draw()
             return {link for handle, link, _ in page.scene.layers[0].members if handle.visible}
 
-        assert shown() == {"pad", "side"}
+        assert visible_links() == {"pad", "side"}
         page.panel.links["pad"].value = False
-        assert shown() == {"side"}
+        assert visible_links() == {"side"}
         page.panel.group.value = "one"
         page.panel.links["pad"].value = True
-        assert shown() == {"side"}
+        assert visible_links() == {"side"}
         page.panel.group.value = "all"
-        assert shown() == {"pad", "side"}
+        assert visible_links() == {"pad", "side"}
         page.panel.parts["taxels"].value = False
-        assert shown() == set()
+        assert visible_links() == set()
         page.panel.also["near"].value = True
         page._react()
         assert [layer.output.name for layer in page.scene.layers] == ["touch", "near"]
@@ -358,7 +358,7 @@ def test_links_groups_and_sensors_are_switched_on_and_off(tmp_path):
         assert {mesh.visible for body in page.scene.robot for mesh, _ in page.scene._meshes[body]} == {False}
 
 
-def test_a_link_and_a_picked_taxel_are_plotted_and_named(document):
+def test_a_chosen_link_is_plotted_and_a_picked_taxel_named(document):
     with opened(SceneStage(tgdsl.compile(document))) as page:
         for _ in range(100):
             page.stage.advance()
@@ -368,12 +368,12 @@ def test_a_link_and_a_picked_taxel_are_plotted_and_named(document):
         force = page.stage.readings["touch"][0, :, :3].norm(dim=-1)
         assert "sum of pad" in page.panel.value.content
         assert page._history[-1][1] == pytest.approx(float(force.sum()), rel=1e-3)
-        most = int(force.argmax())
-        page._pick(most)
+        hottest = int(force.argmax())
+        page._pick(hottest)
         page.draw()
-        assert page.scene._name.text == f"pad, taxel {most}: {float(force[most]):.4g} N"
-        place = ", ".join(f"{1e3 * x:.1f}" for x in page.stage.touch.taxels["touch"]["pos"][most])
-        assert f"({place}) mm" in page.panel.value.content
+        assert page.scene._name.text == f"pad, taxel {hottest}: {float(force[hottest]):.4g} N"
+        position = ", ".join(f"{1e3 * x:.1f}" for x in page.stage.touch.taxels["touch"]["pos"][hottest])
+        assert f"({position}) mm" in page.panel.value.content
 
 
 def test_objects_have_the_colours_of_their_materials():
@@ -387,10 +387,10 @@ def test_objects_have_the_colours_of_their_materials():
 
 
 def test_another_environment_shows_its_own_object(document):
-    own = document.with_name("variants.yaml")
+    variants = document.with_name("variants.yaml")
     shapes = "variants: [{type: sphere, size: [20 mm], density: 600}, {type: box, size: [10 mm, 12 mm, 14 mm], density: 600}]"
-    own.write_text(WITHOUT_PROXIMITY.replace("{body: ball}", f"{{body: ball, {shapes}}}"))
-    with opened(SceneStage(tgdsl.compile(own), num_envs=2)) as page:
+    variants.write_text(WITHOUT_PROXIMITY.replace("{body: ball}", f"{{body: ball, {shapes}}}"))
+    with opened(SceneStage(tgdsl.compile(variants), num_envs=2)) as page:
         assert page.panel.env is not None
         ball = page.stage.model.body("ball").id
 
@@ -426,15 +426,15 @@ def test_temperatures_colour_the_surfaces_of_links(document):
         area = 0.0
         for mesh, _, row in layer.members:
             corners = mesh.vertices[mesh.faces]
-            apart = np.abs(corners.mean(axis=1) - layer.rows.pos[row]).max(axis=1)
-            assert apart.max() < 0.0101  # a triangle's centre is in its cell, or in one next to it
+            distances = np.abs(corners.mean(axis=1) - layer.rows.pos[row]).max(axis=1)
+            assert distances.max() < 0.0101  # a triangle's centre is in its cell, or in one next to it
             area += np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
         assert area == pytest.approx(2 * (0.06**2 + 2 * 0.06 * 0.01), rel=1e-4)
         page._react()
         assert {mesh.visible for mesh, _ in page.scene._meshes[page.stage.model.body("pad").id]} == {False}
 
 
-def test_a_heat_map_has_a_grid_with_its_distal_end_up_and_scattered_taxels_as_dots(document):
+def test_a_heat_map_has_its_distal_end_up_and_scattered_taxels_as_dots(document):
 
     touch = tgdsl.compile(document)
     table = touch.taxels["touch"]
@@ -458,7 +458,7 @@ def test_a_heat_map_has_a_grid_with_its_distal_end_up_and_scattered_taxels_as_do
     assert set(np.unique(dots[dots[..., 1] == 7][:, 0])) == set(colour[:, 0])
 
 
-def test_the_heat_map_of_a_reading_has_its_colours(document):
+def test_the_heat_map_has_the_readings_colours(document):
     with opened(SceneStage(tgdsl.compile(document))) as page:
         for _ in range(100):
             page.stage.advance()
@@ -500,7 +500,7 @@ def test_observations_are_live_values_and_sound_has_a_spectrogram(document):
         assert float(rows["joint_pos"]) == pytest.approx(lift, rel=0.02)
 
 
-def test_a_task_is_moved_by_its_policy_or_by_hand():
+def test_a_task_moves_by_policy_or_by_hand():
     task = View(ROOT / "examples/tasks/in_palm_rotate_cube.yaml")._stage()
     with opened(task) as page:
         assert page.panel.by_hand is not None
@@ -524,8 +524,8 @@ def test_a_task_is_moved_by_its_policy_or_by_hand():
         assert page.panel.observed is not None and page.panel.group_values is not None
         assert page.panel.observed.options == tuple(task.env.groups)
         joint = task.env.joint_names[1]
-        written = re.search(rf"position of {joint} \| (\S+) \| rad", page.panel.group_values.content)
-        assert float(written[1]) == pytest.approx(float(task.env.observe()["proprio"][0, 1]), rel=0.01, abs=1e-3)
+        match = re.search(rf"position of {joint} \| (\S+) \| rad", page.panel.group_values.content)
+        assert float(match[1]) == pytest.approx(float(task.env.observe()["proprio"][0, 1]), rel=0.01, abs=1e-3)
         assert "object_distance" in page.panel.notes.content
 
 
@@ -557,7 +557,7 @@ def hand_log(path: Path) -> tuple[Path, np.ndarray, np.ndarray]:
     return write_log(path, readings, (fault,)), position, counts
 
 
-def test_a_log_of_a_hand_is_posed_at_its_angles_and_forces(tmp_path):
+def test_a_hands_log_has_its_angles_and_forces(tmp_path):
     path, position, counts = hand_log(tmp_path / "log.npz")
     stage = View(path)._stage()
     assert isinstance(stage, HandLogStage)
@@ -585,7 +585,7 @@ def test_a_log_of_a_hand_is_posed_at_its_angles_and_forces(tmp_path):
         assert float(re.search(r"([\d.e+-]+) counts", page.panel.value.content)[1]) == pytest.approx(total, rel=1e-3)
 
 
-def test_a_calibration_gives_the_log_of_a_hand_newtons(tmp_path):
+def test_a_calibration_converts_a_hands_log_to_newtons(tmp_path):
     path, _, counts = hand_log(tmp_path / "log.npz")
     calibration = ROOT / "examples/xhand1_calibration.yaml"
     stage = View(path, calibration=calibration)._stage()
@@ -594,7 +594,7 @@ def test_a_calibration_gives_the_log_of_a_hand_newtons(tmp_path):
     thumb, index = (next(i for i, body in enumerate(bodies) if name in body) for name in ("thumb", "index"))
     force = stage.readings["tips"][0].numpy()
     np.testing.assert_allclose(force[thumb], 0.1 * counts[0, 0], rtol=1e-6)
-    np.testing.assert_allclose(force[index], 0.1 * counts[0, 1, ::-1], rtol=1e-6)  # its sensor looks along the link's x
+    np.testing.assert_allclose(force[index], 0.1 * counts[0, 1, ::-1], rtol=1e-6)  # its sensor faces along the link's x
 
 
 def test_a_calibration_needs_a_hand(document):
@@ -602,7 +602,7 @@ def test_a_calibration_needs_a_hand(document):
         View(document, calibration=ROOT / "examples/xhand1_calibration.yaml")._stage()
 
 
-def test_an_emulated_hand_is_shown_and_an_unplugged_one_says_so():
+def test_an_emulated_hand_is_shown_and_its_unplugging_noted():
     forces = TipForces.zero()
     forces.total[1] = (3, 4, 12)
     with FaultyEmulator(first_order_hand(forces=lambda time, position: forces)) as emulator:
@@ -621,7 +621,7 @@ def test_an_emulated_hand_is_shown_and_an_unplugged_one_says_so():
 
 @pytest.mark.slow
 def test_a_frame_of_667_taxels_takes_less_than_a_twentieth_of_a_second():
-    """Of the processor, so that a busy machine changes nothing: three control steps of 10 ms, and all that is drawn."""
+    """Processor time, so that a busy machine does not matter: three control steps of 10 ms and the drawing."""
     with opened(View(ROOT / "examples/xhand1_palm.yaml", set=("resolution=high",))._stage()) as page, silent_browser(page.url):
         assert len(page.scene.layers[0].rows.body) == 667
         begin = time.process_time()
@@ -638,7 +638,7 @@ def test_a_frame_of_667_taxels_takes_less_than_a_twentieth_of_a_second():
 
 @contextmanager
 def serving(command: View) -> Iterator[Page]:
-    """Serve a command's page in this process, stepped by a thread, and yield it."""
+    """Serve a command's page in this process, with a thread that steps it, and yield it."""
     stage = command._stage()
     page = Page(stage, port=8320)
     is_over = threading.Event()
@@ -674,7 +674,7 @@ def browser():
 
 
 def soon(condition: Callable[[], bool], seconds: float = 60.0) -> bool:
-    """Return whether something comes true before long."""
+    """Return whether a condition becomes true within some seconds."""
     begin = time.monotonic()
     while time.monotonic() - begin < seconds:
         if condition():
@@ -685,7 +685,7 @@ def soon(condition: Callable[[], bool], seconds: float = 60.0) -> bool:
 
 @contextmanager
 def at_rest(page: Page) -> Iterator[None]:
-    """Hold the scene: a browser that draws without a GPU opens, and takes pictures, while no new frames come."""
+    """Pause the scene: without a GPU, a browser opens and takes pictures only while no new frames arrive."""
     was_paused, page.panel.paused.value = page.panel.paused.value, True
     yield
     page.panel.paused.value = was_paused
@@ -713,12 +713,12 @@ def open_page(browser, page: Page):
 
 
 def field_of(view, label: str):
-    """Return the field of a control; of a slider, the one with its number."""
+    """Return the input field of a control; for a slider, the one with its number."""
     return view.get_by_text(label, exact=True).locator("xpath=ancestor::*[.//input][1]").locator("input").last
 
 
 def write(view, label: str, text: str) -> None:
-    """Write a number beside a slider, as typing does; events are sent by hand, as typing waits for frames of the picture."""
+    """Write the number of a slider as typing does; events are sent by hand, since typing would wait for frames."""
     field = field_of(view, label)
     field.focus()
     field.evaluate(
@@ -732,23 +732,23 @@ def write(view, label: str, text: str) -> None:
 
 
 def total(view) -> float:
-    """Return the number that the page writes beside "sum"."""
+    """Return the number next to "sum" on the page."""
     text = view.get_by_text("sum").first.locator("xpath=..").inner_text()
     return float(re.search(r"(-?[\d.]+(?:e-?\d+)?) N", text)[1])
 
 
 def seconds(view) -> float:
-    """Return the scene's time as the page writes it [s]."""
+    """Return the scene's time on the page [s]."""
     return float(re.search(r"t = ([\d.]+) s", view.get_by_text("t = ").first.inner_text())[1])
 
 
 @pytest.mark.browser
 @pytest.mark.slow
-def test_a_browser_shows_a_document_and_its_controls_act(browser, document):
-    own = document.with_name("two_balls.yaml")
+def test_a_browser_shows_a_document_and_its_controls_work(browser, document):
+    file = document.with_name("two_balls.yaml")
     text = DOCUMENT.replace("{body: ball}", f"{{body: ball, {TWO_BALLS}}}")
-    own.write_text(text)
-    with serving(View(own, envs=2)) as page:
+    file.write_text(text)
+    with serving(View(file, envs=2)) as page:
         view = open_page(browser, page)
         with at_rest(page):
             assert soon(lambda: is_drawn(view))
@@ -766,7 +766,7 @@ def test_a_browser_shows_a_document_and_its_controls_act(browser, document):
         assert soon(lambda: page.panel.env_index == 1 and np.ptp(page.scene._meshes[ball][0][0].vertices) < 0.035)
         assert soon(lambda: total(view) == pytest.approx(float(page.stage.readings["touch"][1, :, 2].sum()), rel=0.01))
 
-        # Opened twice: both show the same, and what one sets the other has.
+        # Opened twice: both show the same, and a control set in one changes in the other.
         with at_rest(page):
             other = open_page(browser, page)
             assert soon(lambda: total(other) == total(view) != 0)
@@ -775,23 +775,23 @@ def test_a_browser_shows_a_document_and_its_controls_act(browser, document):
             other.close()
         assert soon(lambda: total(view) == 0)
 
-        # Lost and regained: the scene goes on, and the browser shows it again by itself.
+        # Connection lost: the scene goes on, and the browser reconnects automatically.
         assert soon(lambda: len(page.server.get_clients()) == 1)
-        lost, clients = page.stage.time, set(page.server.get_clients())
-        page.server._websock_server.disconnect_all_clients()  # a browser that is set offline keeps its local connections
-        assert soon(lambda: page.stage.time > lost + 0.2)
+        lost_at, clients = page.stage.time, set(page.server.get_clients())
+        page.server._websock_server.disconnect_all_clients()  # an offline browser would keep its local connections
+        assert soon(lambda: page.stage.time > lost_at + 0.2)
         assert soon(lambda: page.server.get_clients().keys() - clients)
-        assert soon(lambda: seconds(view) > page.stage.time - 1.0 > lost)
+        assert soon(lambda: seconds(view) > page.stage.time - 1.0 > lost_at)
         write(view, "lift", "-0.02")
         assert soon(lambda: total(view) != 0)
 
         view.reload()
         view.get_by_text("16 taxels").wait_for()
-        own.write_text(text.replace("rows: 4", "rows: 3"))
+        file.write_text(text.replace("rows: 4", "rows: 3"))
         view.get_by_text("12 taxels").wait_for()
-        own.write_text(text.replace("kind: proximity", "kind: proximty"))
+        file.write_text(text.replace("kind: proximity", "kind: proximty"))
         view.get_by_text("two_balls.yaml:12").first.wait_for()
-        own.write_text(text)
+        file.write_text(text)
         view.get_by_text("16 taxels").wait_for()
         view.close()
 
@@ -814,7 +814,7 @@ def test_a_browser_shows_a_run_and_scrubs_it(browser, recording):
 
 @pytest.mark.browser
 @pytest.mark.slow
-def test_a_browser_shows_an_emulated_hand_and_saves_what_was_seen(browser, tmp_path):
+def test_a_browser_shows_an_emulated_hand_and_saves_its_frames(browser, tmp_path):
     with serving(View(Path("emulator"))) as page:
         view = open_page(browser, page)
         with at_rest(page):

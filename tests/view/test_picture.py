@@ -1,4 +1,4 @@
-"""Pictures: what is coloured, where it lands on the picture, and what is said when it cannot be drawn."""
+"""Pictures: coloured taxels, their pixels, and errors."""
 
 import struct
 import tracemalloc
@@ -64,7 +64,7 @@ def touch(tmp_path_factory: pytest.TempPathFactory) -> TactileModule:
 @pytest.fixture(scope="module")
 def sim(touch: TactileModule) -> BatchSimulation:
     sim = tgdsl.simulate(touch, num_envs=2)
-    sim.batch.qpos[1, 2] += 0.5  # in the second environment the cube is far above
+    sim.batch.qpos[1, 2] += 0.5  # the second environment's cube is far above
     for _ in range(3):
         sim.step()
     return sim
@@ -85,11 +85,11 @@ def some_markers(pos: list[list[float]], normal: list[list[float]], value: list[
     return Markers(*columns, "depth", "mm")
 
 
-# What is coloured ----------------------------------------------------------------------------------------------------
+# Coloured taxels -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("env", [0, 1])
-def test_colours_exactly_the_taxels_that_read(touch, sim, readings, env: int) -> None:
+def test_exactly_the_active_taxels_are_coloured(touch, sim, readings, env: int) -> None:
     for name, reading in readings.items():
         expected = (reading[env, :, :3] != 0).any(dim=-1).numpy()
         np.testing.assert_array_equal(markers(touch, sim, readings, name, env).is_read, expected)
@@ -97,23 +97,23 @@ def test_colours_exactly_the_taxels_that_read(touch, sim, readings, env: int) ->
     assert not markers(touch, sim, readings, "depth", 1).is_read.any()
 
 
-def test_magnitude_is_the_norm_over_channels_of_one_unit(touch, sim, readings) -> None:
-    shown = markers(touch, sim, readings, "touch")
-    assert shown.colour_label.startswith("|force| [N] ")
-    np.testing.assert_allclose(shown.value, readings["touch"][0, :, :3].norm(dim=-1), rtol=1e-6)
+def test_magnitude_is_the_norm_of_channels_with_one_unit(touch, sim, readings) -> None:
+    result = markers(touch, sim, readings, "touch")
+    assert result.colour_label.startswith("|force| [N] ")
+    np.testing.assert_allclose(result.value, readings["touch"][0, :, :3].norm(dim=-1), rtol=1e-6)
 
 
-def test_small_values_get_a_prefix(touch, sim, readings) -> None:
-    shown = markers(touch, sim, readings, "depth")
-    assert shown.colour_label.startswith("depth [mm] ")
-    np.testing.assert_allclose(shown.value, 1e3 * readings["depth"][0, :, 0].double(), rtol=1e-6)
+def test_small_values_get_a_unit_prefix(touch, sim, readings) -> None:
+    result = markers(touch, sim, readings, "depth")
+    assert result.colour_label.startswith("depth [mm] ")
+    np.testing.assert_allclose(result.value, 1e3 * readings["depth"][0, :, 0].double(), rtol=1e-6)
 
 
-def test_dots_are_where_the_taxels_are(touch, sim, readings) -> None:
-    shown, table = markers(touch, sim, readings, "touch"), touch.taxels["touch"]
+def test_dots_are_at_the_taxels(touch, sim, readings) -> None:
+    result, table = markers(touch, sim, readings, "touch"), touch.taxels["touch"]
     origin = np.where((table["body"] == "pad")[:, None], [0, 0, 0.05], [0.1, 0, 0.05])
-    np.testing.assert_allclose(shown.pos, table["pos"] + origin, atol=TOLERANCE)
-    np.testing.assert_array_equal(shown.size == 0, table["radius"] == 0)
+    np.testing.assert_allclose(result.pos, table["pos"] + origin, atol=TOLERANCE)
+    np.testing.assert_array_equal(result.size == 0, table["radius"] == 0)
 
 
 def test_summary_adds_forces_but_not_depths() -> None:
@@ -129,14 +129,14 @@ def test_summary_adds_forces_but_not_depths() -> None:
 # Camera and pixels ---------------------------------------------------------------------------------------------------
 
 
-def test_projection_by_hand() -> None:
-    """Seen along −x with z up: y runs to the right, and nearness is x."""
+def test_projection_matches_values_by_hand() -> None:
+    """Seen along −x with z up: y points right, and nearness is x."""
     camera = Camera(np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), np.array([1.0, 0, 0]), np.array([0.1, 0.2, 0.3]))
     np.testing.assert_allclose(camera.project(np.array([0.5, 0.25, 0.1])), [0.05, -0.2, 0.4], atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("normal", [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0.6, 0, 0.8], [0, -1, 0]])
-def test_read_taxels_face_the_camera(normal: list[float]) -> None:
+def test_active_taxels_face_the_camera(normal: list[float]) -> None:
     away = [-part for part in normal]
     camera = facing_camera(some_markers([[0, 0, 0.1], [0, 0.1, 0]], [normal, away], [3.0, 1.0]), np.zeros(3))
     axes = np.stack([camera.right, camera.up, camera.toward])
@@ -162,8 +162,8 @@ def test_nearness_is_interpolated() -> None:
     np.testing.assert_allclose(fragments.nearness, (column + 2) + 2 * (row + 2), atol=TOLERANCE)
 
 
-def test_many_triangles_on_one_another_take_little_memory() -> None:
-    """Forty that cover half of 300 × 300 pixels each are 1.8 million fragments; the picture itself is 3.6 MB."""
+def test_many_overlapping_triangles_take_little_memory() -> None:
+    """Forty triangles over half of 300 × 300 pixels are 1.8 million fragments; the picture takes 3.6 MB."""
     corners = np.array([[[0, 0, i], [299, 0, i], [0, 299, i]] for i in range(40)], dtype=float)
     tracemalloc.start()
     fragments = rasterise(corners, 300, 300)
@@ -173,12 +173,14 @@ def test_many_triangles_on_one_another_take_little_memory() -> None:
     assert peak < 60e6
 
 
-def test_hidden_taxels_are_not_seen() -> None:
+def test_hidden_taxels_are_not_visible() -> None:
     fragments = rasterise(np.array([[[0.0, 0, 0.01], [9, 0, 0.01], [0, 9, 0.01]]]), 10, 10)
     camera = Camera(*np.eye(3), np.zeros(3))
-    shown = some_markers([[0, 0, 0]] * 4, [[0, 0, 1]] * 3 + [[0, 0, -1]], [1.0] * 4)
-    at = np.array([[2, 2, 0.01], [2, 2, 0.0], [8, 8, 0.0], [2, 2, 0.01]])  # on it, behind it, beside it, turned away
-    np.testing.assert_array_equal(is_visible(shown, at, fragments, camera), [True, False, True, False])
+    taxels = some_markers([[0, 0, 0]] * 4, [[0, 0, 1]] * 3 + [[0, 0, -1]], [1.0] * 4)
+    positions = np.array(
+        [[2, 2, 0.01], [2, 2, 0.0], [8, 8, 0.0], [2, 2, 0.01]]
+    )  # on the triangle, behind it, next to it, turned away
+    np.testing.assert_array_equal(is_visible(taxels, positions, fragments, camera), [True, False, True, False])
 
 
 @pytest.mark.parametrize(
@@ -191,7 +193,7 @@ def test_hidden_taxels_are_not_seen() -> None:
         ("ellipsoid", ".01 .02 .03", [0.01, 0.02, 0.03]),
     ],
 )
-def test_shapes_are_where_mujoco_has_them(touch, shape: str, size: str, half: list[float]) -> None:
+def test_shapes_have_mujocos_poses(touch, shape: str, size: str, half: list[float]) -> None:
     geom = f'<geom type="{shape}" size="{size}" pos="0.1 0 0" quat="1 0 1 0"/>'  # z of the geom is x of the body
     scene = SCENE.replace("</worldbody>", f'<body name="it" pos="0 0 1" quat="1 0 0 1">{geom}</body></worldbody>')
     spec = tgdsl.instrument(mujoco.MjSpec.from_string(scene), touch.inputs)
@@ -207,7 +209,7 @@ def test_shapes_are_where_mujoco_has_them(touch, shape: str, size: str, half: li
     assert ((mesh.normals.mean(axis=1) * outward).sum(axis=1) > 0).all()
 
 
-def test_short_names_drop_what_all_share() -> None:
+def test_short_names_drop_the_common_prefix() -> None:
     names = short_names(["right_hand_link", "right_hand_mid_link2", "right_hand_thumb_rota_link1"])
     assert list(names.values()) == ["hand_link", "mid_link2", "thumb_rota_link1"]
     assert short_names(["pad"]) == {"pad": "pad"}
@@ -230,8 +232,8 @@ FINGER = """
 
 
 @pytest.mark.parametrize("joint", ["type='slide' axis='0 1 0'", "type='hinge' axis='1 0 0' pos='0 0 .03'"])
-def test_a_jaw_whose_origin_is_its_middle_points_away_from_its_mount(joint: str) -> None:
-    """It hangs below the mount, and its taxels are about its origin: they do not say which end is distal."""
+def test_a_jaw_with_its_origin_in_the_middle_points_away_from_its_mount(joint: str) -> None:
+    """It hangs below the mount with taxels around its origin, which do not tell the distal end."""
     jaw = f"<body name='jaw' pos='0 .03 -.05'><joint {joint}/><geom type='box' size='.01 .004 .03'/></body>"
     model = mujoco.MjModel.from_xml_string(
         f"<mujoco><worldbody><body name='mount'><geom size='.01'/>{jaw}</body></worldbody></mujoco>"
@@ -242,7 +244,7 @@ def test_a_jaw_whose_origin_is_its_middle_points_away_from_its_mount(joint: str)
 
 @pytest.mark.parametrize("along", [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
 def test_maps_have_the_distal_end_up_as_seen_from_outside(tmp_path: Path, along: list[int]) -> None:
-    """The finger runs along x, its taxels look along z: up is x, and the right of the map −y, whatever the columns run along."""
+    """The finger runs along x, its taxels face z: the map's up is x and its right −y, for any direction of columns."""
     (tmp_path / "finger.xml").write_text(FINGER)
     grid = {"method": "grid", "rows": 3, "columns": 3, "direction": [0, 0, -1], "columns_along": along, "radius": 0.004}
     layout = {
@@ -264,21 +266,21 @@ def test_maps_have_the_distal_end_up_as_seen_from_outside(tmp_path: Path, along:
     figure = drawing(module, sim, {"depth": torch.tensor(value)[None, :, None]})
     maps = {axes.get_label(): axes for axes in figure.axes if axes.get_label() in ("palm", "near", "far")}
     for name in ("palm", "far"):
-        own = table["link"] == name
-        order = np.lexsort((-table["pos"][own, 1].round(6), -table["pos"][own, 0].round(6)))
-        np.testing.assert_allclose(maps[name].collections[0].get_array().ravel(), 1e3 * value[own][order])
+        taxels = table["link"] == name
+        order = np.lexsort((-table["pos"][taxels, 1].round(6), -table["pos"][taxels, 0].round(6)))
+        np.testing.assert_allclose(maps[name].collections[0].get_array().ravel(), 1e3 * value[taxels][order])
     x, y = np.asarray(maps["near"].collections[0].get_offsets()).T
-    own = table["pos"][table["link"] == "near"]
-    np.testing.assert_allclose(x, -1e3 * own[:, 1], atol=1e-6)
-    np.testing.assert_allclose(y, 1e3 * own[:, 0], atol=1e-6)
+    taxels = table["pos"][table["link"] == "near"]
+    np.testing.assert_allclose(x, -1e3 * taxels[:, 1], atol=1e-6)
+    np.testing.assert_allclose(y, 1e3 * taxels[:, 0], atol=1e-6)
     marks = {name: [text.get_text() for text in axes.texts] for name, axes in maps.items()}
     assert marks == {"palm": ["▲ distal"], "near": ["▲ distal"], "far": ["▲ tip"]}
     named = {text.get_text() for text in figure.axes[0].texts}
     assert {axes.get_title().splitlines()[0] for axes in maps.values()} <= named
 
 
-def test_a_link_on_a_visual_mesh_is_drawn_as_that(tmp_path: Path) -> None:
-    """An OBJ file of two objects whose box of 20 × 20 × 60 mm does not collide, round a core of 10 mm that does."""
+def test_a_link_on_a_visual_mesh_is_drawn_with_it(tmp_path: Path) -> None:
+    """An OBJ file with two objects: a visual box of 20 × 20 × 60 mm around a colliding core of 10 mm."""
     boxes = [trimesh.creation.box((0.02, 0.02, 0.03)).apply_translation((0, 0, z)) for z in (-0.015, 0.015)]
     lines, count = [], 1
     for i, box in enumerate(boxes):
@@ -293,11 +295,11 @@ def test_a_link_on_a_visual_mesh_is_drawn_as_that(tmp_path: Path) -> None:
     )
     grid = {"method": "grid", "rows": 6, "columns": 2, "direction": [-1, 0, 0], "radius": 0.004}
     with pytest.warns(UserWarning, match="read whole"):
-        model, found, _ = placed(
+        model, layouts, _ = placed(
             {"tgdsl": 1, "robot": {"model": str(tmp_path / "hand.xml"), "layout": {"resolutions": {"o": {"skin": grid}}}}}
         )
     body, pose = {model.body("tip").id}, pose_of(model, None)
-    skin = mesh_of(model, pose, body, found["o"].links).corners.reshape(-1, 3)
+    skin = mesh_of(model, pose, body, layouts["o"].links).corners.reshape(-1, 3)
     np.testing.assert_allclose([skin.min(axis=0), skin.max(axis=0)], [[-0.01, -0.01, -0.03], [0.01, 0.01, 0.03]], atol=1e-7)
     assert np.abs(mesh_of(model, pose, body).corners).max() == pytest.approx(0.005)
 
@@ -306,7 +308,7 @@ def test_a_link_on_a_visual_mesh_is_drawn_as_that(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_writes_a_png(touch, sim, readings, tmp_path: Path) -> None:
+def test_picture_writes_a_png(touch, sim, readings, tmp_path: Path) -> None:
     path = picture(touch, sim, readings, tmp_path / "new" / "touch.png", env=1, reading="depth", title="A pad")
     header = path.read_bytes()[:24]
     assert path == tmp_path / "new" / "touch.png"
@@ -315,23 +317,23 @@ def test_writes_a_png(touch, sim, readings, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_default_is_the_kinematic_taxel(touch, sim, readings, tmp_path: Path) -> None:
+def test_the_default_reading_is_the_kinematic_taxel(touch, sim, readings, tmp_path: Path) -> None:
     chosen = picture(touch, sim, readings, tmp_path / "chosen.png", reading="touch").read_bytes()
     assert picture(touch, sim, readings, tmp_path / "default.png").read_bytes() == chosen
     assert picture(touch, sim, readings, tmp_path / "other.png", reading="depth").read_bytes() != chosen
 
 
-def test_unknown_reading(touch, sim, readings, tmp_path: Path) -> None:
+def test_an_unknown_reading_is_refused(touch, sim, readings, tmp_path: Path) -> None:
     with pytest.raises(TgdslError, match=r'^there is no reading "dept"; did you mean "depth"\?$'):
         picture(touch, sim, readings, tmp_path / "x.png", reading="dept")
 
 
 @pytest.mark.parametrize("env", [-1, 2])
-def test_environment_out_of_range(touch, sim, readings, tmp_path: Path, env: int) -> None:
+def test_an_environment_out_of_range_is_refused(touch, sim, readings, tmp_path: Path, env: int) -> None:
     with pytest.raises(TgdslError, match=rf"^environment {env} does not exist, expected 0 to 1$"):
         picture(touch, sim, readings, tmp_path / "x.png", env=env)
 
 
-def test_readings_of_another_module(touch, sim, tmp_path: Path) -> None:
+def test_readings_of_another_module_are_refused(touch, sim, tmp_path: Path) -> None:
     with pytest.raises(TgdslError, match=r"^there is nothing to draw: the readings given hold none of this module's taxels$"):
         picture(touch, sim, {}, tmp_path / "x.png")

@@ -1,4 +1,4 @@
-"""Pictures of hands: where the discs land, which are in view, what the legend counts, and what is said of a mistake."""
+"""Pictures of hands: positions and visibility of discs, legends, and errors."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from tgdsl.view.render import HEIGHT, MIN_SIZE, discs, drawing, group_of, legend
 
 TOLERANCE = 1e-9  # metres and pixels: centimetres in float64, a rotation and a sum
 
-# A palm whose taxels look along +x, a finger above it that can bend toward them, and a lid in front of the palm's lower half.
+# A palm with taxels that face +x, a finger above it that bends toward them, and a lid in front of the palm's lower half.
 ROBOT = """
 <mujoco model="hand"><worldbody>
 <body name="palm" pos="0.3 0 0.1" quat="1 0 0 0.4">
@@ -68,27 +68,27 @@ def hand(folder: Path) -> Drawn:
 
 
 def marks(axes: Axes, which: str) -> np.ndarray:
-    """Return the middle of each disc, or the two ends of each tick, in pixels of the panel."""
-    found = next(part for part in axes.collections if part.get_gid() == which)
-    paths = [path.vertices[:24] if which != "normals" else path.vertices for path in found.get_paths()]
+    """Return the centre of each disc, or the two ends of each tick, in pixels of the panel."""
+    collection = next(part for part in axes.collections if part.get_gid() == which)
+    paths = [path.vertices[:24] if which != "normals" else path.vertices for path in collection.get_paths()]
     return np.array([np.asarray(path).mean(axis=0) if which != "normals" else path for path in paths])
 
 
 def one_link(pos: list[list[float]], normal: list[list[float]], **more) -> Layout:
     count = len(pos)
     values = {"radius": np.full(count, 0.004), "area": np.full(count, 1e-4), "groups": {}} | more
-    at, out = np.array(pos, dtype=float), np.array(normal, dtype=float)
-    same = {"link_id": np.zeros(count, dtype=np.int64), "tangent": out[:, [1, 2, 0]], "cell": np.full((count, 2), -1)}
-    return Layout(links=(Link("palm", "palm"),), pos=at, normal=out, **same, **values)
+    positions, normals = np.array(pos, dtype=float), np.array(normal, dtype=float)
+    fields = {"link_id": np.zeros(count, dtype=np.int64), "tangent": normals[:, [1, 2, 0]], "cell": np.full((count, 2), -1)}
+    return Layout(links=(Link("palm", "palm"),), pos=positions, normal=normals, **fields, **values)
 
 
-# Where taxels are drawn ----------------------------------------------------------------------------------------------
+# Positions of taxels ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("view", VIEWS)
 @pytest.mark.parametrize("keyframe", [None, "bent"])
-def test_discs_are_where_the_taxels_are(hand: Drawn, view: str, keyframe: str | None) -> None:
-    """Positions by MuJoCo's own matrices; the hand's corners, which fill the panel with a margin, give the scale."""
+def test_discs_are_at_the_taxels(hand: Drawn, view: str, keyframe: str | None) -> None:
+    """Positions by MuJoCo's matrices; the hand's corners, which fill the panel up to a margin, give the scale."""
     model, layouts = hand
     figure = drawing(model, layouts, view=view, keyframe=keyframe, size=SMALL)
     state = mujoco.MjData(model)
@@ -102,19 +102,19 @@ def test_discs_are_where_the_taxels_are(hand: Drawn, view: str, keyframe: str | 
     for axes, layout in zip(figure.axes, layouts.values(), strict=True):
         body = [model.body(layout.links[i].body).id for i in layout.link_id]
         pos = np.array([state.xpos[b] + state.xmat[b].reshape(3, 3) @ p for b, p in zip(body, layout.pos, strict=True)])
-        place = (pos[layout.radius > 0] @ np.stack([camera.right, camera.up], axis=1) - (low + high) / 2).round(12)
-        found = np.concatenate([marks(axes, name).reshape(-1, 2) for name in ("shown", "hidden")])
+        offsets = (pos[layout.radius > 0] @ np.stack([camera.right, camera.up], axis=1) - (low + high) / 2).round(12)
+        centres = np.concatenate([marks(axes, name).reshape(-1, 2) for name in ("shown", "hidden")])
         bounds = np.array([axes.get_xlim(), axes.get_ylim()]) + 0.5
         scale = (bounds[:, 1] / ((high - low) + 0.03 * (high - low).max())).min()
-        expected = bounds.mean(axis=1) + scale * place
-        order, other = (np.lexsort(points.round(3).T) for points in (found, expected))
-        np.testing.assert_allclose(found[order], expected[other], atol=1e-6)
+        expected = bounds.mean(axis=1) + scale * offsets
+        order, expected_order = (np.lexsort(points.round(3).T) for points in (centres, expected))
+        np.testing.assert_allclose(centres[order], expected[expected_order], atol=1e-6)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("view", VIEWS)
-def test_what_is_in_view_is_what_a_ray_to_the_camera_leaves(hand: Drawn, view: str) -> None:
-    """MuJoCo's rays know neither pixels nor triangles."""
+def test_visible_taxels_match_mujocos_rays_to_the_camera(hand: Drawn, view: str) -> None:
+    """MuJoCo's rays use neither pixels nor triangles."""
     model, layouts = hand
     pose = pose_of(model, "bent")
     camera = camera_of(view, model, list(layouts.values()), pose, model.body("palm").id)
@@ -124,24 +124,24 @@ def test_what_is_in_view_is_what_a_ray_to_the_camera_leaves(hand: Drawn, view: s
     figure, total = drawing(model, layouts, view=view, keyframe="bent", size=(1000, 600)), 0
     for axes, layout in zip(figure.axes, layouts.values(), strict=True):
         taxels = taxels_of(model, pose, layout)
-        clear = np.zeros(len(taxels.pos), dtype=bool)
+        is_clear = np.zeros(len(taxels.pos), dtype=bool)
         for i, start in enumerate(taxels.pos + 1e-6 * taxels.normal):
             hit = mujoco.mj_ray(model, state, start, camera.toward, None, 1, -1, np.zeros(1, dtype=np.int32))
-            clear[i] = hit < 0 and taxels.normal[i] @ camera.toward > 0
-        active = layout.radius > 0
-        assert len(marks(axes, "shown")) == len(marks(axes, "normals")) == (clear & active).sum()
-        assert len(marks(axes, "hidden")) == (~clear & active).sum()
-        total += (clear & active).sum()
+            is_clear[i] = hit < 0 and taxels.normal[i] @ camera.toward > 0
+        is_active = layout.radius > 0
+        assert len(marks(axes, "shown")) == len(marks(axes, "normals")) == (is_clear & is_active).sum()
+        assert len(marks(axes, "hidden")) == (~is_clear & is_active).sum()
+        total += (is_clear & is_active).sum()
     assert total > 0 or view == "back"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["xhand1_right", "sharpa_right"])
-def test_real_hands_show_their_taxels(name: str) -> None:
-    """From the front hardly any taxel is hidden (some look away, round a tip or on the thumb); from the back most are."""
-    model, found, _ = placed({"tgdsl": 1, "robot": {"model": name}})
-    front, back = (drawing(model, found, view=view, size=(1500, 500)) for view in ("front", "back"))
-    for axes, behind, layout in zip(front.axes, back.axes, found.values(), strict=True):
+def test_bundled_hands_show_their_taxels(name: str) -> None:
+    """From the front few taxels are hidden (at tips or on the thumb); from the back most are."""
+    model, layouts, _ = placed({"tgdsl": 1, "robot": {"model": name}})
+    front, back = (drawing(model, layouts, view=view, size=(1500, 500)) for view in ("front", "back"))
+    for axes, behind, layout in zip(front.axes, back.axes, layouts.values(), strict=True):
         assert len(marks(axes, "shown")) + len(marks(axes, "hidden")) == layout.num_taxels
         assert len(marks(axes, "shown")) > 0.9 * layout.num_taxels
         assert len(marks(behind, "shown")) < 0.2 * layout.num_taxels
@@ -157,7 +157,7 @@ def test_ticks_start_at_the_discs_and_show_a_wrong_normal(hand: Drawn) -> None:
     right = one_link([[0.005, 0, 0.06], [0.005, 0.02, 0.06]], [[1, 0, 0], [1, 0, 0]])
     wrong = one_link([[0.005, 0, 0.06], [0.005, 0.02, 0.06]], [[1, 0, 0], [0.6, 0, 0.8]])
     ends = [marks(drawing(model, {"x": layout}, size=SMALL).axes[0], "normals") for layout in (right, wrong)]
-    lengths = [np.linalg.norm(np.diff(each, axis=1), axis=-1).ravel() for each in ends]
+    lengths = [np.linalg.norm(np.diff(tick_ends, axis=1), axis=-1).ravel() for tick_ends in ends]
     np.testing.assert_allclose(*lengths[0])
     assert lengths[1].max() > 2 * lengths[0].max()
     np.testing.assert_allclose(ends[0][:, 0], marks(drawing(model, {"x": right}, size=SMALL).axes[0], "shown"), atol=1e-6)
@@ -167,15 +167,17 @@ def test_discs_lie_in_tangent_planes(hand: Drawn) -> None:
     model, layouts = hand
     layout = layouts["few"]
     taxels, radius = taxels_of(model, pose_of(model, "bent"), layout), radii(layout, layout.pos)
-    out = discs(taxels, radius) - taxels.pos[:, None]
-    np.testing.assert_allclose(np.einsum("tcx,tx->tc", out, taxels.normal), 0, atol=TOLERANCE)
-    np.testing.assert_allclose(np.linalg.norm(out, axis=-1), np.broadcast_to(radius[:, None], out.shape[:2]), atol=TOLERANCE)
+    offsets = discs(taxels, radius) - taxels.pos[:, None]
+    np.testing.assert_allclose(np.einsum("tcx,tx->tc", offsets, taxels.normal), 0, atol=TOLERANCE)
+    np.testing.assert_allclose(
+        np.linalg.norm(offsets, axis=-1), np.broadcast_to(radius[:, None], offsets.shape[:2]), atol=TOLERANCE
+    )
 
 
 def test_discs_do_not_overlap(hand: Drawn) -> None:
     layout = hand[1]["many"]
-    apart = np.linalg.norm(layout.pos[:36, None] - layout.pos[None, :36], axis=-1) + np.eye(36)
-    assert 2 * radii(layout, layout.pos)[:36].max() < apart.min()
+    distances = np.linalg.norm(layout.pos[:36, None] - layout.pos[None, :36], axis=-1) + np.eye(36)
+    assert 2 * radii(layout, layout.pos)[:36].max() < distances.min()
 
 
 # The camera ----------------------------------------------------------------------------------------------------------
@@ -187,24 +189,24 @@ def test_the_front_faces_the_mean_normal_with_the_fingers_up(hand: Drawn) -> Non
     axes = mujoco.MjData(model)
     mujoco.mj_forward(model, axes)
     palm = axes.xmat[model.body("palm").id].reshape(3, 3)
-    for view, (around, rise) in VIEWS.items():
+    for view, (azimuth, elevation) in VIEWS.items():
         camera = camera_of(view, model, [layouts["few"]], pose, model.body("palm").id)
         frame = np.stack([camera.right, camera.up, camera.toward])
         np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=TOLERANCE)
         assert np.linalg.det(frame) == pytest.approx(1)
-        assert camera.toward @ palm[:, 0] == pytest.approx(np.cos(np.radians(around)) * np.cos(np.radians(rise)))
-        assert camera.up @ palm[:, 2] == pytest.approx(np.cos(np.radians(rise)))
+        assert camera.toward @ palm[:, 0] == pytest.approx(np.cos(np.radians(azimuth)) * np.cos(np.radians(elevation)))
+        assert camera.up @ palm[:, 2] == pytest.approx(np.cos(np.radians(elevation)))
     assert camera_of("right", model, [layouts["few"]], pose, 1).toward @ palm[:, 1] > 0.9  # the picture's right, seen from +x
 
 
-def test_the_camera_stays_with_the_palm(hand: Drawn) -> None:
+def test_the_camera_does_not_follow_the_fingers(hand: Drawn) -> None:
     model, layouts = hand
     straight, bent = (camera_of("iso", model, [layouts["few"]], pose_of(model, name), 1) for name in ("open", "bent"))
     np.testing.assert_allclose(straight, bent, atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("normal", [[1, 0, 0], [0, 0, 1], [0, 0, -1], [0, -1, 0], [0.6, 0, 0.8]])
-def test_the_front_faces_a_pad_that_looks_anywhere(hand: Drawn, normal: list[float]) -> None:
+def test_the_front_faces_a_pad_of_any_direction(hand: Drawn, normal: list[float]) -> None:
     model, _ = hand
     layout = one_link([[0, 0, 0.04]], [normal])
     pose = pose_of(model, None)
@@ -212,14 +214,14 @@ def test_the_front_faces_a_pad_that_looks_anywhere(hand: Drawn, normal: list[flo
     assert camera_of("front", model, [layout], pose, 1).toward @ taxels.normal[0] > 0.65
 
 
-# Groups and words ----------------------------------------------------------------------------------------------------
+# Groups and labels ---------------------------------------------------------------------------------------------------
 
 
 def test_a_link_has_the_colour_of_its_smallest_group(hand: Drawn) -> None:
     _, layouts = hand
     assert group_of(layouts["few"]) == ["all", "tips"]
     assert legend(layouts["few"]) == {"other all": 4, "tips": 6}
-    assert legend(layouts["many"]) == {"other all": 36, "tips": 2}  # a filler is no taxel
+    assert legend(layouts["many"]) == {"other all": 36, "tips": 2}  # fillers do not count
 
 
 def test_legend_without_groups() -> None:
@@ -229,7 +231,7 @@ def test_legend_without_groups() -> None:
     assert legend(named) == {"palm": 3}
 
 
-def test_titles(hand: Drawn) -> None:
+def test_titles_name_resolutions_and_count_taxels(hand: Drawn) -> None:
     figure = drawing(*hand, size=SMALL)
     assert [axes.get_label() for axes in figure.axes] == ["few", "many"]
     titles = [[part.get_text() for part in axes.artists[0].get_child().get_children()] for axes in figure.axes]
@@ -240,7 +242,7 @@ def test_titles(hand: Drawn) -> None:
 
 
 @pytest.mark.slow
-def test_the_same_bytes_twice(hand: Drawn, tmp_path: Path) -> None:
+def test_a_picture_is_reproducible(hand: Drawn, tmp_path: Path) -> None:
     model, layouts = hand
     first = render(model, layouts, tmp_path / "new" / "first.png")
     assert first == tmp_path / "new" / "first.png"
@@ -249,8 +251,8 @@ def test_the_same_bytes_twice(hand: Drawn, tmp_path: Path) -> None:
     assert matplotlib.image.imread(first).shape[0] == HEIGHT
 
 
-def test_size_and_frame(hand: Drawn, tmp_path: Path) -> None:
-    """The hand fills its panel: in the middle, there is ink within two pixels of the margins that are meant."""
+def test_the_hand_fills_a_panel_of_the_given_size(hand: Drawn, tmp_path: Path) -> None:
+    """In the middle, ink comes within 2.5 pixels of the intended margins."""
     model, layouts = hand
     path = render(model, {"few": layouts["few"]}, tmp_path / "x.png", size=(640, 500))
     image = matplotlib.image.imread(path)[..., :3]
@@ -268,48 +270,48 @@ def test_size_and_frame(hand: Drawn, tmp_path: Path) -> None:
         ({"size": (500, 20)}, rf"^a picture of 500 × 20 pixels is too small, expected at least {MIN_SIZE} of each$"),
     ],
 )
-def test_bad_choices(hand: Drawn, tmp_path: Path, chosen: dict, message: str) -> None:
+def test_invalid_options_are_refused(hand: Drawn, tmp_path: Path, chosen: dict, message: str) -> None:
     with pytest.raises(TgdslError, match=message):
         render(*hand, tmp_path / "x.png", **chosen)
     assert not (tmp_path / "x.png").exists()
 
 
-def test_nothing_to_draw(hand: Drawn, tmp_path: Path) -> None:
+def test_layouts_without_taxels_are_refused(hand: Drawn, tmp_path: Path) -> None:
     for empty in ({}, {"x": one_link([[0, 0, 0]], [[0, 0, 1]], radius=np.zeros(1))}):
         with pytest.raises(TgdslError, match=r"^there is nothing to draw: no layout has a taxel$"):
             render(hand[0], empty, tmp_path / "x.png")
 
 
-def test_a_file_that_cannot_be_written(hand: Drawn, tmp_path: Path) -> None:
+def test_an_unwritable_file_is_an_error(hand: Drawn, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file" / "x.png", tmp_path):
         with pytest.raises(TgdslError, match=f"^cannot write {out}: "):
             render(hand[0], {"few": hand[1]["few"]}, out)
 
 
-# What a document draws -----------------------------------------------------------------------------------------------
+# Documents -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_document_without_sensors_has_all_taxels_at_all_resolutions(hand: Drawn) -> None:
+def test_a_document_without_sensors_has_all_taxels_and_resolutions(hand: Drawn) -> None:
     assert {name: layout.num_taxels for name, layout in hand[1].items()} == {"few": 10, "many": 39}
 
 
 def test_a_document_has_the_taxels_of_its_sensors_at_its_resolution(folder: Path) -> None:
-    found = placed(folder / "hand.yaml").layouts
-    assert {name: layout.num_taxels for name, layout in found.items()} == {"many": 3}
-    found = placed(folder / "hand.yaml", resolutions=("many", "few")).layouts
-    assert {name: layout.num_taxels for name, layout in found.items()} == {"many": 3, "few": 6}
-    found = placed(folder / "hand.yaml", {"sensors.touch.links": "all", "resolution": "few"}).layouts
-    assert {name: layout.num_taxels for name, layout in found.items()} == {"few": 10}
+    layouts = placed(folder / "hand.yaml").layouts
+    assert {name: layout.num_taxels for name, layout in layouts.items()} == {"many": 3}
+    layouts = placed(folder / "hand.yaml", resolutions=("many", "few")).layouts
+    assert {name: layout.num_taxels for name, layout in layouts.items()} == {"many": 3, "few": 6}
+    layouts = placed(folder / "hand.yaml", {"sensors.touch.links": "all", "resolution": "few"}).layouts
+    assert {name: layout.num_taxels for name, layout in layouts.items()} == {"few": 10}
 
 
 def test_progress_names_the_links(folder: Path) -> None:
-    told: list[str] = []
-    placed(folder / "bare.yaml", resolutions=("few",), progress=told.append)
-    assert told[-2:] == ["placing taxels on palm (1 of 2 links)", "placing taxels on finger (2 of 2 links)"]
+    messages: list[str] = []
+    placed(folder / "bare.yaml", resolutions=("few",), progress=messages.append)
+    assert messages[-2:] == ["placing taxels on palm (1 of 2 links)", "placing taxels on finger (2 of 2 links)"]
 
 
-def test_the_layout_drawn_is_the_layout_compiled(folder: Path) -> None:
+def test_the_drawn_layout_is_the_compiled_one(folder: Path) -> None:
     plan = tgdsl.compile(folder / "hand.yaml").plan
     drawn = placed(folder / "hand.yaml").layouts["many"]
     assert drawn.links == plan.layout.links
@@ -317,7 +319,7 @@ def test_the_layout_drawn_is_the_layout_compiled(folder: Path) -> None:
         np.testing.assert_array_equal(getattr(drawn, name), getattr(plan.layout, name))
 
 
-def test_mistakes_of_documents(folder: Path, tmp_path: Path) -> None:
+def test_mistakes_of_documents_are_reported(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(TgdslError, match=r'^the layout has no resolution "man"; did you mean "many"\?$'):
         placed(folder / "bare.yaml", resolutions=("man",))
     with pytest.raises(SpecError, match=r'--set resolution=fw: resolution: unknown resolution "fw"; did you mean "few"\?$'):
@@ -359,7 +361,7 @@ def test_command_draws_a_robot_by_name(command, tmp_path: Path) -> None:
     assert command("xhand1", "--resolutions", "low", "-o", out) == (0, f"low: 90 taxels\npicture: {out}\n", "")
 
 
-def test_mistakes_of_the_command(command, folder: Path, tmp_path: Path) -> None:
+def test_mistakes_of_the_command_are_reported(command, folder: Path, tmp_path: Path) -> None:
     tgdsl.save(tgdsl.compile(folder / "hand.yaml"), folder / "hand.safetensors")
     (tmp_path / "lone.xml").write_text(ROBOT)
     only = 'tgdsl: an artefact has the layout and resolution it was compiled with, "many", and no other\n'

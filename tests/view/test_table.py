@@ -49,7 +49,7 @@ def readings() -> dict[str, torch.Tensor]:
     return {name: torch.stack([0 * value, value]).requires_grad_() for name, value in first.items()}
 
 
-def test_numbers(touch):
+def test_numbers_match_sums_by_hand(touch):
     # palm: |(3, 4, 12)| = 13; largest depth 2.5 mm. tip: |(-6, 8, 0)| = 10; one of two taxels; largest |torque| 0.5
     assert table(touch, readings(), env=1) == [
         "link  touch [N]  depth [m]  depth/clean [m]  bit [taxels]  twist [N·m]",
@@ -65,7 +65,7 @@ def test_the_first_environment_is_the_default(touch):
 
 
 def test_rounding_is_printed_as_zero(touch):
-    """Up to 1 µm and 1 µN·m, which float32 leaves of centimetres and newtons."""
+    """Up to 1 µm and 1 µN·m, float32's rounding of centimetres and newtons."""
     small = {"depth": torch.full((1, 3, 1), 0.9e-6), "depth/clean": torch.full((1, 3, 1), 1.1e-6)}
     rest = {name: value[:1] for name, value in readings().items() if name not in small}
     assert table(touch, rest | small)[2].split() == ["palm", "0.000", "0", "1.10e-06", "–", "–"]

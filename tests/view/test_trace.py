@@ -1,4 +1,4 @@
-"""What a video shows of touch: spheres where MuJoCo has the taxels' sites, colours by reading, and bars by sums by hand."""
+"""Touch in videos: spheres at the taxels' sites, colours of readings, and bars by sums by hand."""
 
 import mujoco
 import numpy as np
@@ -70,7 +70,7 @@ def test_spheres_are_at_the_taxels_in_the_colours_of_their_readings(touch, trace
         np.testing.assert_allclose(sphere.rgba, HEAT(size / 5) if size else HEAT(-1.0), atol=1e-6)
 
 
-def test_a_full_scene_takes_no_more(trace):
+def test_a_full_scene_gets_no_more_spheres(trace):
     model = mujoco.MjModel.from_xml_string(SCENE)
     data, scene = mujoco.MjData(model), mujoco.MjvScene(model, 2)
     mujoco.mj_forward(model, data)
@@ -78,8 +78,8 @@ def test_a_full_scene_takes_no_more(trace):
     assert scene.ngeom == 2
 
 
-def test_bars_are_as_long_as_the_sums_of_the_links(trace):
-    """Of 6 N, the left link's most; it is measured where bars end, in pixels of its row's middle."""
+def test_bars_are_proportional_to_the_sums_of_links(trace):
+    """Relative to 6 N, the left link's largest sum; measured in pixels along the middle of each row."""
     bars = trace.bars()
     np.testing.assert_allclose(bars.parts, np.array([[0, 0], [6, 2], [5, 0]]) / 6)
     frame = np.zeros((200, 400, 3), dtype=np.uint8)
