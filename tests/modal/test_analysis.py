@@ -1,4 +1,4 @@
-"""From shape and material to frequencies [Hz], decays [1/s] and gains [1/kg]; the modes that are kept; and errors."""
+"""From shape and material to frequencies [Hz], decays [1/s] and gains [1/kg]; kept modes; errors."""
 
 import dataclasses
 
