@@ -1,4 +1,4 @@
-"""Only one file touches torch's private parts, and these do what tgdsl expects."""
+"""Only one file touches torch's private parts, and they work as tgdsl expects."""
 
 import ast
 from pathlib import Path
