@@ -58,7 +58,7 @@ def test_seeding_restarts_the_count(build):
 
 @pytest.mark.slow
 def test_the_second_process_has_the_second_half(tmp_path):
-    """Two processes of a distributed run, of 4 environments each, read what one of 8 reads; nobody passes their ranks."""
+    """Two processes of 4 environments in a distributed run find their ranks, and read what one process of 8 reads."""
     spec = document(tmp_path, {"s": {"noise": RANGES}})
     torch.multiprocessing.spawn(read_of_rank, (str(tmp_path / "store"), spec, str(tmp_path)), nprocs=2)
     whole = read(tgdsl.compile(spec, dtype=torch.float64), range(4))
