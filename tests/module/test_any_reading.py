@@ -1,4 +1,4 @@
-"""Observations of any reading and channel, the table of terms, and what is wrong with readings that are handed in."""
+"""Observations of any reading and channel, the table of terms, and invalid readings."""
 
 import numpy as np
 import pytest
@@ -13,22 +13,22 @@ CHANNELS = ("distance_item", "nearest_item_x", "nearest_item_y", "nearest_item_z
 
 
 def features(reading: torch.Tensor, channels: list[int]) -> np.ndarray:
-    """Return what is observed, written down number by number: the oldest call first, in it channel by channel, row by row."""
+    """Return the expected features, one by one: oldest call first, then by channel, then by row."""
     steps = reading.unbind(1) if reading.ndim == 4 else [reading]
     return np.array(
         [[float(s[e, row, c]) for s in steps for c in channels for row in range(s.shape[1])] for e in range(len(reading))]
     )
 
 
-def test_all_channels_of_any_reading(tmp_path):
-    """A distance, a pressure, a report per body: none of them has a type of its own."""
+def test_a_term_observes_all_channels_of_any_reading(tmp_path):
+    """A distance, a pressure and a value per body, which have no term type of their own."""
     terms = [{"type": "reading", "of": name} for name in ("dist", "force", "force/missed")]
     touch = joint_module(tmp_path, {"policy": terms}, force={**FORCE, "outputs": ["pressure"]})
     readings = touch(touch.example_state(3))
     expected = [features(readings[name], list(range(readings[name].shape[2]))) for name in ("dist", "force", "force/missed")]
-    found = touch.observe(readings)["policy"].numpy()
-    np.testing.assert_array_equal(found, np.concatenate(expected, axis=1))
-    assert found.shape[1] == 4 * 4 + 4 * 1 + readings["force/missed"][0].numel()
+    policy = touch.observe(readings)["policy"].numpy()
+    np.testing.assert_array_equal(policy, np.concatenate(expected, axis=1))
+    assert policy.shape[1] == 4 * 4 + 4 * 1 + readings["force/missed"][0].numel()
 
 
 @pytest.mark.parametrize(
@@ -41,21 +41,21 @@ def test_all_channels_of_any_reading(tmp_path):
         (["nearest_item_[xz]"], [1, 3]),
     ],
 )
-def test_channels_by_name_and_wildcard(tmp_path, channels, expected):
+def test_channels_are_chosen_by_name_or_wildcard(tmp_path, channels, expected):
     touch = joint_module(tmp_path, {"policy": [{"type": "reading", "of": "dist", "channels": channels}]})
     assert touch.outputs[0].channels == CHANNELS
     readings = touch(touch.example_state(2))
     np.testing.assert_array_equal(touch.observe(readings)["policy"].numpy(), features(readings["dist"], expected))
 
 
-def test_stacked_calls_of_some_channels(tmp_path):
+def test_channels_of_stacked_calls_are_chosen(tmp_path):
     dist = {"kind": "surface_distance", "links": "*", "feels": ["item"], "nearest": True, "history": 3}
     touch = joint_module(tmp_path, {"policy": [{"type": "reading", "of": "near", "channels": ["nearest_item_y"]}]}, near=dist)
     for seed in range(4):
         readings = touch(touch.example_state(2, seed=seed))
-    found = touch.observe(readings)
-    np.testing.assert_array_equal(found["policy"].numpy(), features(readings["near"], [2]))
-    assert touch.observations["policy"][0].size == found["policy"].shape[1] == 3 * 4
+    groups = touch.observe(readings)
+    np.testing.assert_array_equal(groups["policy"].numpy(), features(readings["near"], [2]))
+    assert touch.observations["policy"][0].size == groups["policy"].shape[1] == 3 * 4
     (term,) = touch.observations["policy"]
     assert repr(touch.observations).splitlines()[2].split() == ["policy", term.name, term.type, "0:12"]
 
@@ -70,7 +70,7 @@ def test_stacked_calls_of_some_channels(tmp_path):
         ({"of": "joint_pos"}, "of", 'unknown sensor "joint_pos"; no sensor makes it: {type: joint_pos} observes it'),
     ],
 )  # fmt: skip
-def test_mistakes_are_told_where_they_are(tmp_path, term, where, message):
+def test_mistakes_have_their_place_in_the_document(tmp_path, term, where, message):
     document = joint_document(tmp_path, {"policy": [{"type": "none"}, {"type": "reading", **term}]})
     with pytest.raises(SpecError) as caught:
         tgdsl.compile(document)
@@ -78,8 +78,8 @@ def test_mistakes_are_told_where_they_are(tmp_path, term, where, message):
     assert message in str(caught.value)
 
 
-def test_the_table_is_what_is_observed(tmp_path):
-    """Each term's slice holds what a group of that term alone observes, stacked calls too."""
+def test_the_table_of_terms_matches_the_observations(tmp_path):
+    """Each term's slice equals a group with only that term, including stacked calls."""
     near = {"kind": "surface_distance", "links": "*", "feels": ["item"], "nearest": True, "history": 2}
     terms = [
         {"type": "none"},
@@ -93,13 +93,13 @@ def test_the_table_is_what_is_observed(tmp_path):
     touch = joint_module(tmp_path, groups, near=near)
     for seed in range(3):
         readings = touch(touch.example_state(2, seed=seed))
-    found, table = touch.observe(readings), touch.observations
-    assert table.keys() == found.keys()
+    observations, table = touch.observe(readings), touch.observations
+    assert table.keys() == observations.keys()
     for i, term in enumerate(table["policy"]):
         assert term.type == terms[i]["type"]
-        assert (found["policy"][:, term.slice] == found[f"only{i}"]).all()
-        assert term.size == found[f"only{i}"].shape[1] == term.slice.stop - term.slice.start
-    assert sum(term.size for term in table["policy"]) == found["policy"].shape[1]
+        assert (observations["policy"][:, term.slice] == observations[f"only{i}"]).all()
+        assert term.size == observations[f"only{i}"].shape[1] == term.slice.stop - term.slice.start
+    assert sum(term.size for term in table["policy"]) == observations["policy"].shape[1]
     assert [term.name for term in table["policy"]] == ["none", "joint_pos", "near[2]", "dist", "last_action", "near[5]"]
     assert [term.name for term in table["only2"]] == ["near"]
 
@@ -122,7 +122,7 @@ def test_readings_that_do_not_fit_are_named(tmp_path, change, message):
         touch.observe(change(touch(touch.example_state(2))))
 
 
-def test_without_a_reading_there_is_no_number_of_environments(tmp_path):
+def test_readings_are_needed_for_the_number_of_environments(tmp_path):
     touch = joint_module(tmp_path, {"policy": [{"type": "none"}]})
     with pytest.raises(ObservationError, match="there are no readings, so nothing says how many environments there are"):
         touch.observe({})
@@ -131,15 +131,14 @@ def test_without_a_reading_there_is_no_number_of_environments(tmp_path):
     assert touch.observe(touch(touch.example_state(2)))["policy"].shape == (2, 0)
 
 
-def test_an_observation_of_reading_is_the_old_types(tmp_path):
+def test_a_reading_term_equals_the_older_force_term(tmp_path):
     terms = {"new": [{"type": "reading", "of": "force"}], "old": [{"type": "force", "of": "force"}]}
     touch = joint_module(tmp_path, terms, force=FORCE)
-    found = touch.observe(touch(touch.example_state(4)))
-    assert (found["new"] == found["old"]).all()
+    groups = touch.observe(touch(touch.example_state(4)))
+    assert (groups["new"] == groups["old"]).all()
 
 
-def test_observing_is_one_graph(tmp_path):
-    """No graph breaks, whatever stands in a group."""
+def test_observe_compiles_to_one_graph(tmp_path):
     terms = [
         {"type": "reading", "of": "dist", "channels": ["nearest_item_z", "distance_item"]},
         {"type": "joint_pos", "joints": ["curl"]},

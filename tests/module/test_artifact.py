@@ -1,4 +1,4 @@
-"""Artefacts: the same bytes from the same document, whole or not at all, and refused by name when they are something else."""
+"""Artefacts: reproducible, written atomically, and refused with a reason if they are something else."""
 
 import dataclasses
 import hashlib
@@ -44,7 +44,7 @@ observations:
   policy: [{type: force, of: touch}, {type: agg_bool, of: bit}]
 """
 REACH = "quantities/contact_depth/uses/0/reach"
-"""An array of the plan: how far each probe feels each object."""
+"""An array of the plan: the range of each probe for each object."""
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +61,8 @@ def artifact(document):
     return document.parent / "hand.safetensors"
 
 
-def test_an_artefact_says_what_it_was_made_from(tmp_path):
-    """The robot by the SHA-256 of its file and of all that it includes, the document by that of what it says."""
+def test_an_artefact_has_hashes_of_robot_and_document(tmp_path):
+    """SHA-256 of the robot's file with its includes, and of the document's content without comments."""
     (tmp_path / "scene.xml").write_text(SCENE.replace("<worldbody>", '<include file="more.xml"/><worldbody>', 1))
     (tmp_path / "more.xml").write_text("<mujocoinclude><option timestep='0.002'/></mujocoinclude>")
     (tmp_path / "hand.yaml").write_text(DOCUMENT)
@@ -75,7 +75,7 @@ def test_an_artefact_says_what_it_was_made_from(tmp_path):
     assert compile_document(tmp_path / "hand.yaml").plan.origin.document_sha256 != origin.document_sha256
 
 
-def test_the_same_bytes_twice(document, artifact, tmp_path):
+def test_artefacts_are_reproducible(document, artifact, tmp_path):
     size = save_plan(compile_document(document).plan, tmp_path / "again.safetensors")
     content = artifact.read_bytes()
     assert (tmp_path / "again.safetensors").read_bytes() == content
@@ -83,7 +83,7 @@ def test_the_same_bytes_twice(document, artifact, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_same_bytes_from_other_processes(document, artifact, tmp_path):
+def test_artefacts_are_reproducible_in_other_processes(document, artifact, tmp_path):
     program = "import sys; from tgdsl.module.artifact import *; from tgdsl.compiler.pipeline import *; save_plan(compile_document(sys.argv[1]).plan, sys.argv[2])"
     for seed in ("1", "4242"):
         out = tmp_path / f"{seed}.safetensors"
@@ -92,33 +92,33 @@ def test_the_same_bytes_from_other_processes(document, artifact, tmp_path):
         assert out.read_bytes() == artifact.read_bytes()
 
 
-def test_a_plan_comes_back_whole(document, artifact):
-    plan, found = compile_document(document).plan, load_plan(artifact)
+def test_a_plan_round_trips(document, artifact):
+    plan, loaded = compile_document(document).plan, load_plan(artifact)
     for field in dataclasses.fields(plan):
-        (own, _), (other, _) = (tree.flatten(getattr(of, field.name), field.name) for of in (plan, found))
-        assert other == own and type(getattr(found, field.name)) is type(getattr(plan, field.name)), field.name
-    assert found.inputs == plan.inputs and found.origin == plan.origin and found.objects == plan.objects
-    assert [type(part) for part in found.quantities.values()] == [type(part) for part in plan.quantities.values()]
-    assert list(found.arrays) == list(plan.arrays)
+        (expected, _), (result, _) = (tree.flatten(getattr(side, field.name), field.name) for side in (plan, loaded))
+        assert result == expected and type(getattr(loaded, field.name)) is type(getattr(plan, field.name)), field.name
+    assert loaded.inputs == plan.inputs and loaded.origin == plan.origin and loaded.objects == plan.objects
+    assert [type(part) for part in loaded.quantities.values()] == [type(part) for part in plan.quantities.values()]
+    assert list(loaded.arrays) == list(plan.arrays)
     for name, array in plan.arrays.items():
-        assert found.arrays[name].dtype == array.dtype
-        np.testing.assert_array_equal(found.arrays[name], array)
+        assert loaded.arrays[name].dtype == array.dtype
+        np.testing.assert_array_equal(loaded.arrays[name], array)
         with pytest.raises(ValueError, match="read-only"):
-            found.arrays[name][...] = 0
+            loaded.arrays[name][...] = 0
 
 
 def test_a_loaded_module_reads_the_same(document, artifact, tmp_path):
     touch = tgdsl.compile(document)
     assert tgdsl.save(touch, tmp_path / "saved.safetensors") == artifact.stat().st_size
-    again = tgdsl.load(tmp_path / "saved.safetensors")
+    loaded = tgdsl.load(tmp_path / "saved.safetensors")
     state = touch.example_state(16)
     for name, reading in touch(state).items():
-        assert torch.equal(again(state)[name], reading)
-    assert again.inputs == touch.inputs
+        assert torch.equal(loaded(state)[name], reading)
+    assert loaded.inputs == touch.inputs
     assert tgdsl.load(artifact, dtype=torch.float64).dtype == torch.float64
 
 
-def refused(path) -> str:
+def refusal_of(path) -> str:
     with pytest.raises(ArtifactError) as caught:
         tgdsl.load(path)
     message = str(caught.value)
@@ -127,56 +127,58 @@ def refused(path) -> str:
 
 
 @pytest.mark.parametrize("keep", [0, 4, 100, -1], ids=["empty", "no_header", "half_header", "last_byte_gone"])
-def test_truncated_files(artifact, tmp_path, keep):
+def test_truncated_files_are_refused(artifact, tmp_path, keep):
     (tmp_path / "t.safetensors").write_bytes(artifact.read_bytes()[:keep])
-    assert refused(tmp_path / "t.safetensors").startswith("cannot read this artefact: ")
+    assert refusal_of(tmp_path / "t.safetensors").startswith("cannot read this artefact: ")
 
 
-def test_damaged_header(artifact, tmp_path):
+def test_a_damaged_header_is_refused(artifact, tmp_path):
     content = bytearray(artifact.read_bytes())
     content[20:40] = b"\xff" * 20
     (tmp_path / "d.safetensors").write_bytes(content)
-    assert refused(tmp_path / "d.safetensors").startswith("cannot read this artefact: ")
+    assert refusal_of(tmp_path / "d.safetensors").startswith("cannot read this artefact: ")
 
 
-def test_files_that_are_no_artefacts(tmp_path):
-    assert refused(tmp_path / "none.safetensors").startswith("cannot read this artefact: ")
+def test_files_that_are_not_artefacts_are_refused(tmp_path):
+    assert refusal_of(tmp_path / "none.safetensors").startswith("cannot read this artefact: ")
     (tmp_path / "folder.safetensors").mkdir()
-    assert refused(tmp_path / "folder.safetensors").startswith("this is a folder, expected an artefact")
+    assert refusal_of(tmp_path / "folder.safetensors").startswith("this is a folder, expected an artefact")
     (tmp_path / "hand.yaml").write_text("tgdsl: 1\n")
-    assert refused(tmp_path / "hand.yaml") == "this is a document, not an artefact; tgdsl.compile reads documents"
+    assert refusal_of(tmp_path / "hand.yaml") == "this is a document, not an artefact; tgdsl.compile reads documents"
     (tmp_path / "foreign.safetensors").write_bytes(save({"weight": np.zeros(3)}, {"format": "pt"}))
-    assert refused(tmp_path / "foreign.safetensors") == "this safetensors file was not written by tgdsl"
+    assert refusal_of(tmp_path / "foreign.safetensors") == "this safetensors file was not written by tgdsl"
     (tmp_path / "bare.safetensors").write_bytes(save({"weight": np.zeros(3)}))
-    assert refused(tmp_path / "bare.safetensors") == "this safetensors file was not written by tgdsl"
+    assert refusal_of(tmp_path / "bare.safetensors") == "this safetensors file was not written by tgdsl"
 
 
-def rewritten(artifact, path, text: str) -> None:
+def write_with_plan(artifact, path, text: str) -> None:
     path.write_bytes(save(load(artifact.read_bytes()), {"tgdsl": text}))
 
 
-def test_other_versions_and_other_contents(artifact, tmp_path):
+def test_other_versions_and_contents_are_refused(artifact, tmp_path):
     path, plain = tmp_path / "other.safetensors", json.loads(load_plan(artifact).to_json())
-    rewritten(artifact, path, json.dumps(plain | {"format": FORMAT + 1}))
+    write_with_plan(artifact, path, json.dumps(plain | {"format": FORMAT + 1}))
     assert (
-        refused(path)
+        refusal_of(path)
         == f"plan format {FORMAT + 1} is not {FORMAT}, which this version of tgdsl reads; compile the document again"
     )
-    rewritten(artifact, path, json.dumps({k: v for k, v in plain.items() if k != "format"}))
-    assert refused(path) == f"plan format None is not {FORMAT}, which this version of tgdsl reads; compile the document again"
-    rewritten(artifact, path, json.dumps({k: v for k, v in plain.items() if k != "layout"}))
-    assert refused(path).startswith("not a plan: ")
-    rewritten(artifact, path, json.dumps(plain | {"layout": 3}))
-    assert refused(path).startswith("not a plan: ")
+    write_with_plan(artifact, path, json.dumps({k: v for k, v in plain.items() if k != "format"}))
+    assert (
+        refusal_of(path) == f"plan format None is not {FORMAT}, which this version of tgdsl reads; compile the document again"
+    )
+    write_with_plan(artifact, path, json.dumps({k: v for k, v in plain.items() if k != "layout"}))
+    assert refusal_of(path).startswith("not a plan: ")
+    write_with_plan(artifact, path, json.dumps(plain | {"layout": 3}))
+    assert refusal_of(path).startswith("not a plan: ")
     for text in ("", "{", "3", "null"):
-        rewritten(artifact, path, text)
-        assert refused(path).startswith("not a plan: ")
+        write_with_plan(artifact, path, text)
+        assert refusal_of(path).startswith("not a plan: ")
 
 
-def test_a_kind_that_is_not_given(artifact, tmp_path):
+def test_an_unknown_kind_is_named(artifact, tmp_path):
     path, plain = tmp_path / "own.safetensors", json.loads(load_plan(artifact).to_json())
     plain["sensors"][0]["kind"] = "kinematic_taxle"
-    rewritten(artifact, path, json.dumps(plain))
+    write_with_plan(artifact, path, json.dumps(plain))
     with pytest.raises(TgdslError) as caught:
         tgdsl.load(path)
     assert str(caught.value) == (
@@ -184,7 +186,7 @@ def test_a_kind_that_is_not_given(artifact, tmp_path):
     )
 
 
-def test_a_failure_leaves_what_was_there(artifact, tmp_path, monkeypatch):
+def test_a_failed_save_keeps_the_old_file(artifact, tmp_path, monkeypatch):
     plan, path = load_plan(artifact), tmp_path / "hand.safetensors"
     path.write_bytes(b"before")
 
@@ -198,14 +200,14 @@ def test_a_failure_leaves_what_was_there(artifact, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_the_file_has_the_mode_of_any_other(artifact, tmp_path):
+def test_an_artefact_has_the_mode_of_a_new_file(artifact, tmp_path):
     (tmp_path / "plain").write_bytes(b"")
     save_plan(load_plan(artifact), tmp_path / "hand.safetensors")
     assert (tmp_path / "hand.safetensors").stat().st_mode == (tmp_path / "plain").stat().st_mode
     assert sorted(path.name for path in tmp_path.iterdir()) == ["hand.safetensors", "plain"]
 
 
-def test_arrays_that_were_tampered_with(artifact, tmp_path):
+def test_changed_arrays_are_refused(artifact, tmp_path):
     content = artifact.read_bytes()
     arrays = load(content)
     header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]
@@ -220,4 +222,4 @@ def test_arrays_that_were_tampered_with(artifact, tmp_path):
         half,
     ):
         (tmp_path / "bad.safetensors").write_bytes(save(bad, header))
-        assert refused(tmp_path / "bad.safetensors") == "the arrays differ from the arrays that the plan was written with"
+        assert refusal_of(tmp_path / "bad.safetensors") == "the arrays differ from the arrays that the plan was written with"

@@ -1,4 +1,4 @@
-"""Random states are valid: what a solver could have returned, whatever the seed."""
+"""Random states are valid: a solver could have returned them, for any seed."""
 
 import pytest
 import torch
@@ -28,8 +28,8 @@ def touch(tmp_path_factory):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_contacts_are_those_of_a_solver(touch, seed):
-    """Unit normals, forces in the friction cone about them, and a net force that is the sum; unused slots are zero."""
+def test_contacts_could_come_from_a_solver(touch, seed):
+    """Unit normals, forces in their friction cone, and the net force as their sum; unused slots are zero."""
     state = touch.example_state(50, seed=seed)
     normal, force = state.contact_normal, state.contact_force
     is_used = torch.arange(SLOTS) % 3 != 2
@@ -44,8 +44,8 @@ def test_contacts_are_those_of_a_solver(touch, seed):
     torch.testing.assert_close(torch.cross(state.contact_torque, normal, dim=-1), torch.zeros_like(force), rtol=0, atol=1e-15)
 
 
-def test_bodies_and_contacts_spread_as_asked(touch):
-    """Standard deviations of 3,000 numbers, to 5 %; quaternions have unit length."""
+def test_bodies_and_contacts_have_the_requested_spread(touch):
+    """Standard deviations of 3,000 numbers, to 5 %."""
     state = touch.example_state(500, spread=0.2)
     torch.testing.assert_close(state.body_quat.norm(dim=-1), torch.ones(500, len(touch.inputs.bodies)).double())
     links = state.body_pos[:, [touch.inputs.bodies.index(pair.link) for pair in touch.inputs.pairs], None]

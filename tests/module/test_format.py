@@ -1,7 +1,7 @@
 """The promise of a release: files that 0.2.0 wrote load in later versions and read the same.
 
-`python tests/module/test_format.py` writes such a file with the version that is installed; it belongs to a release, so
-files of earlier releases stay as they are.
+`python tests/module/test_format.py` writes such a file with the installed version. It is part of a release; files of earlier
+releases stay unchanged.
 """
 
 from pathlib import Path
@@ -16,7 +16,7 @@ from tgdsl.module.state import SceneState
 KEPT = Path(__file__).parent / "kept"
 RELEASES = sorted(file.stem for file in KEPT.glob("*.safetensors"))
 RTOL = 1e-4
-"""Of each channel's largest magnitude; readings are float32, and sums of torch differ between machines."""
+"""Relative to each channel's largest magnitude; readings are float32, and torch's sums differ between machines."""
 SCENE = """
 <mujoco>
   <worldbody>
@@ -70,7 +70,7 @@ def test_a_file_of_a_release_loads_and_reads_the_same(release):
 
 
 def write(folder: Path, release: str) -> None:
-    """Write an artefact of all kinds of touch, three states of its scene, and what it reads of them."""
+    """Write an artefact with all kinds of touch sensors, three states of its scene, and their readings."""
     (folder / "scene.xml").write_text(SCENE)
     touch = tgdsl.compile(DOCUMENT | {"robot": DOCUMENT["robot"] | {"model": str(folder / "scene.xml")}})
     tgdsl.save(touch, KEPT / f"{release}.safetensors")

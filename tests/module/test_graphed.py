@@ -1,4 +1,4 @@
-"""When calls are captured again, and that what is remembered is left as it was; what is captured needs a GPU."""
+"""When calls are captured again, and that capturing leaves memory unchanged. Real captures need a GPU."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from tgdsl.module.calls import WARM_CALLS, Graphed
 
 
 class Recorder:
-    """Captures as a GPU does: the call runs beforehand, and a replay writes to the tensors that were captured."""
+    """Captures like a GPU: the call runs first, and a replay writes to the captured tensors."""
 
     def __init__(self):
         self.count = 0
@@ -16,13 +16,13 @@ class Recorder:
         self.count += 1
         for _ in range(WARM_CALLS):
             call()
-        made = {name: torch.full_like(value, float("nan")) for name, value in call().items()}
+        outputs = {name: torch.full_like(value, float("nan")) for name, value in call().items()}
 
         def replay():
             for name, value in call().items():
-                made[name].copy_(value)
+                outputs[name].copy_(value)
 
-        return replay, made
+        return replay, outputs
 
 
 def add_up(tensors, memory):
@@ -36,37 +36,37 @@ def inputs(num_envs, seed, dtype=torch.float32):
     return {"a": a, "b": torch.randint(0, 5, (num_envs, 2), generator=generator)}
 
 
-def test_replays_are_calls():
-    recorder, memory, own = Recorder(), {"total": torch.zeros(4)}, {"total": torch.zeros(4)}
+def test_replays_equal_calls():
+    recorder, memory, expected_memory = Recorder(), {"total": torch.zeros(4)}, {"total": torch.zeros(4)}
     graphed = Graphed(add_up, recorder)
     for seed in range(5):
-        found, expected = graphed(inputs(4, seed), memory), add_up(inputs(4, seed), own)
-        assert found.keys() == expected.keys()
-        assert all(torch.equal(found[name], expected[name]) for name in found)
-        assert torch.equal(memory["total"], own["total"])
+        results, expected = graphed(inputs(4, seed), memory), add_up(inputs(4, seed), expected_memory)
+        assert results.keys() == expected.keys()
+        assert all(torch.equal(results[name], expected[name]) for name in results)
+        assert torch.equal(memory["total"], expected_memory["total"])
     assert recorder.count == 1
 
 
 @pytest.mark.parametrize("change", ["batch", "dtype", "memory"])
-def test_it_is_captured_anew_when_something_lies_elsewhere(change):
+def test_other_shapes_dtypes_or_memory_are_captured_again(change):
     recorder, memory = Recorder(), {"total": torch.zeros(4)}
     graphed = Graphed(add_up, recorder)
     graphed(inputs(4, 0), memory)
     num_envs, dtype = (6, torch.float32) if change == "batch" else (4, torch.float64 if change == "dtype" else torch.float32)
     if change != "dtype":
         memory = {"total": torch.ones(num_envs)}
-    own = {"total": memory["total"].clone()}
-    found, expected = graphed(inputs(num_envs, 1, dtype), memory), add_up(inputs(num_envs, 1, dtype), own)
+    expected_memory = {"total": memory["total"].clone()}
+    results, expected = graphed(inputs(num_envs, 1, dtype), memory), add_up(inputs(num_envs, 1, dtype), expected_memory)
     assert recorder.count == 2
-    assert all(torch.equal(found[name], expected[name]) for name in found)
-    assert torch.equal(memory["total"], own["total"])
+    assert all(torch.equal(results[name], expected[name]) for name in results)
+    assert torch.equal(memory["total"], expected_memory["total"])
 
 
-def test_what_was_captured_under_inference_mode_serves_without_it():
+def test_a_capture_under_inference_mode_works_outside():
     memory = {"total": torch.zeros(4)}
     graphed = Graphed(add_up, Recorder())
     with torch.inference_mode():
         graphed(inputs(4, 0), memory)
-    found = graphed(inputs(4, 1), memory)
-    assert not found["a"].is_inference()
-    assert torch.equal(found["a"], 2 * inputs(4, 1)["a"])
+    results = graphed(inputs(4, 1), memory)
+    assert not results["a"].is_inference()
+    assert torch.equal(results["a"], 2 * inputs(4, 1)["a"])

@@ -1,4 +1,4 @@
-"""Readings as images: each pixel is the taxel of that row and column."""
+"""Readings as images: each pixel is the taxel of its row and column."""
 
 import numpy as np
 import pytest
@@ -48,20 +48,20 @@ def test_a_pixel_is_the_taxel_of_its_row_and_column(touch):
     assert images["pad"].shape == (2, 6, 3, 4) and images["disc"].shape == (2, 6, 6, 6)
     table = touch.taxels["touch"]
     for link, image in images.items():
-        own = np.flatnonzero(table["link"] == link)
-        for taxel in own:
+        taxels = np.flatnonzero(table["link"] == link)
+        for taxel in taxels:
             row, column = table["row"][taxel], table["column"][taxel]
             assert masks[link][row, column]
             torch.testing.assert_close(image[:, :, row, column], readings["touch"][:, taxel], rtol=0, atol=0)
-        assert masks[link].sum() == len(own)
+        assert masks[link].sum() == len(taxels)
     assert masks["pad"].all() and not masks["disc"][0, 0] and not images["disc"][:, :, ~masks["disc"]].any()
-    # On a disc of radius 20 mm the 6 × 6 cells, 6.67 mm wide, whose centres are inside: all but the corners.
+    # On a disc of radius 20 mm, of 6 × 6 cells of 6.67 mm, those with their centre inside.
     centre = (np.arange(6) - 2.5) * 0.04 / 6
     np.testing.assert_array_equal(masks["disc"].numpy(), np.hypot(centre[:, None], centre) < 0.02)
 
 
-def test_an_image_follows_the_poses(touch):
-    """A derivative with respect to a pixel's taxel arrives."""
+def test_images_have_gradients(touch):
+    """The gradient of an image reaches only its link's taxels."""
     readings = {name: value.requires_grad_() for name, value in {"touch/clean": torch.randn(1, 45, 6)}.items()}
     images, _ = touch.images("touch/clean", readings)
     images["pad"].sum().backward()
@@ -69,7 +69,7 @@ def test_an_image_follows_the_poses(touch):
     assert gradient is not None and gradient[:, :12].eq(1).all() and not gradient[:, 12:].any()
 
 
-def test_what_has_no_image(touch):
+def test_readings_without_an_image_are_refused(touch):
     readings = touch(touch.example_state(1))
     with pytest.raises(TgdslError, match='there is no reading of taxels "tuch"; did you mean "touch"'):
         touch.images("tuch", readings)

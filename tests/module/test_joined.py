@@ -1,4 +1,4 @@
-"""Sensors of one kind on different taxels are computed as one, and read what each reads alone."""
+"""Sensors of one kind on different taxels are computed as one and read the same as alone."""
 
 import pytest
 import torch
@@ -22,7 +22,7 @@ POSES = {
     "bar": (0, 0, 0.03, 1, 0, 0, 0),
     "ball": (0.03, 0.005, 0.038, 1, 0, 0, 0),
 }
-"""Position [m] and orientation of each body; ball and bar overlap, so that either may be the deeper one."""
+"""Position [m] and orientation of each body; ball and bar overlap, so either may be deeper."""
 SOFT = {"kind": "kinematic_taxel", "normal_stiffness": 300, "gate": "geometric"}
 STIFF = {**SOFT, "normal_stiffness": 800, "depth_exponent": 1.5, "shear_damping": 5.0}
 DEPTH = {"kind": "contact_depth", "gate": "geometric"}
@@ -56,17 +56,17 @@ def document(tmp_path):
 
 
 def state(touch, step):
-    """Return random poses about the start in which both pads feel the bar, for the bodies that a module wants."""
+    """Return a state with random poses in which both pads feel the bar."""
     generator = torch.Generator().manual_seed(step)
 
     def random(scale, width):
         return {name: scale * torch.randn(6, width, generator=generator, dtype=torch.float64) for name in POSES}
 
-    shift, turn, linvel, angvel = random(3e-4, 3), random(5e-3, 4), random(0.1, 3), random(1.0, 3)
+    shift, rotation, linvel, angvel = random(3e-4, 3), random(5e-3, 4), random(0.1, 3), random(1.0, 3)
     pos = {name: torch.tensor(pose[:3], dtype=torch.float64) + shift[name] for name, pose in POSES.items()}
-    quat = {name: torch.tensor(pose[3:], dtype=torch.float64) + turn[name] for name, pose in POSES.items()}
-    own = touch.inputs.bodies
-    fields = (torch.stack([part[name] for name in own], dim=1) for part in (pos, quat, linvel, angvel))
+    quat = {name: torch.tensor(pose[3:], dtype=torch.float64) + rotation[name] for name, pose in POSES.items()}
+    names = touch.inputs.bodies
+    fields = (torch.stack([part[name] for name in names], dim=1) for part in (pos, quat, linvel, angvel))
     return SceneState(*fields, dt=0.01)
 
 
@@ -75,7 +75,7 @@ def joined(touch):
 
 
 def num_queries(touch):
-    """Return how often distances are measured, to however many depths they lead."""
+    """Return how often distances are measured."""
     return len(touch.plan.quantities["contact_depth"].queries)
 
 
@@ -83,7 +83,7 @@ LEFT, RIGHT = {"links": "a", **SOFT}, {"links": "b", **STIFF}
 
 
 @pytest.mark.parametrize("noise", [{}, {"noise": NOISE}], ids=["clean", "noisy"])
-def test_each_reads_what_it_reads_alone(document, noise):
+def test_joined_sensors_read_the_same_as_alone(document, noise):
     sensors = {"left": {**LEFT, **noise}, "right": RIGHT}
     both = tgdsl.compile(document(**sensors), dtype=torch.float64)
     assert joined(both) == {"left": ("left", "right"), "right": ("left", "right")}
@@ -92,15 +92,15 @@ def test_each_reads_what_it_reads_alone(document, noise):
     alone = {name: tgdsl.compile(document(**{name: sensor}), dtype=torch.float64) for name, sensor in sensors.items()}
     assert [joined(touch) for touch in alone.values()] == [{"left": ()}, {"right": ()}]
     for step in range(4):
-        found = both(state(both, step))
+        readings = both(state(both, step))
         for name, touch in alone.items():
             expected = touch(state(touch, step))[name]
             assert (expected[..., 2].abs() > 0).any(dim=1).all()
-            torch.testing.assert_close(found[name], expected, rtol=1e-12, atol=1e-12)
+            torch.testing.assert_close(readings[name], expected, rtol=1e-12, atol=1e-12)
             assert both.plan.layout_of(both.plan.sensor_of(name)).bodies == touch.plan.layout_of(touch.plan.sensors[0]).bodies
 
 
-def test_parameters_stay_each_sensors_own(document):
+def test_joined_sensors_keep_their_parameters(document):
     touch = tgdsl.compile(document(left=LEFT, right=RIGHT), dtype=torch.float64)
     before = touch(state(touch, 0))
     stiffness = touch.constants["sensors/right/normal_stiffness"].requires_grad_()
@@ -120,18 +120,18 @@ def test_parameters_stay_each_sensors_own(document):
         ({"left": LEFT, "right": {**RIGHT, "outputs": ["force"]}}, 2),
         ({"left": LEFT, "right": {"links": "b", **DEPTH}}, 2),
         ({"left": LEFT, "right": {**RIGHT, "noise": {"radius_noise": 1e-4}}}, 2),
-        ({"left": LEFT, "right": RIGHT, "again": {"links": "b", **SOFT}}, 2),  # on the same taxels as another one
-        ({"left": LEFT, "right": RIGHT, "depth": {"links": "b", **DEPTH}}, 2),  # else it would be measured twice
+        ({"left": LEFT, "right": RIGHT, "again": {"links": "b", **SOFT}}, 2),  # on the same taxels as another sensor
+        ({"left": LEFT, "right": RIGHT, "depth": {"links": "b", **DEPTH}}, 2),  # its depth would be measured twice
     ],
     ids=["objects", "channels", "kinds", "radius noise", "twice", "shared"],
 )
-def test_what_differs_in_more_stays_apart(document, sensors, expected):
+def test_sensors_with_other_differences_stay_separate(document, sensors, expected):
     touch = tgdsl.compile(document(**sensors))
     assert not any(joined(touch).values())
     assert num_queries(touch) == expected
 
 
-def test_all_that_measure_the_same_taxels_are_joined_alike(document):
+def test_all_sensors_on_the_same_taxels_are_joined_the_same_way(document):
     depths = {"depth_a": {"links": "a", **DEPTH}, "depth_b": {"links": "b", **DEPTH}}
     touch = tgdsl.compile(document(left=LEFT, right=RIGHT, **depths), dtype=torch.float64)
     assert set(joined(touch).values()) == {("left", "right"), ("depth_a", "depth_b")}

@@ -50,7 +50,7 @@ def touch(document):
     return tgdsl.compile(document)
 
 
-def test_what_is_missing_or_misshapen_is_named(touch):
+def test_missing_and_misshapen_fields_are_named(touch):
     good = touch.example_state(3)
     table = [
         ({"body_quat": None}, "SceneState lacks body_quat, which this module reads"),
@@ -73,7 +73,7 @@ def test_what_is_missing_or_misshapen_is_named(touch):
         assert str(caught.value) == message
 
 
-def test_a_pose_that_is_no_number_is_warned_of_once(touch):
+def test_a_pose_that_is_not_finite_is_warned_of_once(touch):
     state = touch.example_state(4)
     state.body_quat[2, 1, 0] = torch.nan
     with pytest.warns(
@@ -81,11 +81,11 @@ def test_a_pose_that_is_no_number_is_warned_of_once(touch):
     ) as caught:
         readings = touch(state)
     assert caught[0].filename == __file__
-    assert [bool(own.isnan().any()) for own in readings["touch"]] == [False, False, True, False]
+    assert [bool(reading.isnan().any()) for reading in readings["touch"]] == [False, False, True, False]
     touch(state)  # warnings are errors
 
 
-def test_what_is_not_wanted_is_ignored(touch):
+def test_unwanted_fields_are_ignored(touch):
     state = touch.example_state(2)
     expected = touch(state)["touch"]
     state.contact_netforce = torch.zeros(7)
@@ -94,10 +94,10 @@ def test_what_is_not_wanted_is_ignored(touch):
 
 def test_contacts_may_be_boolean_or_counts(touch):
     state = touch.example_state(4)
-    found = torch.tensor([[0.0], [1.0], [4.0], [0.0]])
+    counts = torch.tensor([[0.0], [1.0], [4.0], [0.0]])
     readings = []
-    for kind in (found, found > 0, found.int()):
-        state.contact_found = kind
+    for values in (counts, counts > 0, counts.int()):
+        state.contact_found = values
         touch.reset()
         readings.append(touch(state)["touch"])
     torch.testing.assert_close(readings[0], readings[1], rtol=0, atol=0)
@@ -123,13 +123,13 @@ def test_outputs_and_taxels_describe_the_readings(touch):
     ]
 
 
-def test_rows_of_bodies_name_their_links(document):
+def test_rows_per_body_name_their_links(document):
     document["sensors"] = {"load": {"kind": "link_contact", "links": "all", "feels": ["item"]}}
     touch = tgdsl.compile(document)
     assert touch.outputs[0].rows == "body" and touch.outputs[0].shape == (2, 4)
     table = touch.rows["load"]
     assert table["body"].tolist() == ["pad", "tip"] == table["links"].tolist()
-    assert len(touch.taxels["load"]) == 13  # what lies on its links, not the rows
+    assert len(touch.taxels["load"]) == 13  # taxels on its links, not rows
 
 
 def test_readings_are_views_of_channel_major_storage(touch):
@@ -137,13 +137,13 @@ def test_readings_are_views_of_channel_major_storage(touch):
     assert reading.transpose(1, 2).is_contiguous()
 
 
-def test_both_readouts_are_the_same_without_noise(touch):
+def test_without_noise_both_readouts_are_equal(touch):
     readings = touch(touch.example_state(5))
     torch.testing.assert_close(readings["touch"], readings["touch/clean"], rtol=0, atol=0)
 
 
-def test_only_what_is_needed_is_planned(touch):
-    """Links without a sensor and objects that none feels reach neither inputs nor arrays; one query serves both sensors."""
+def test_the_plan_has_only_what_its_sensors_need(touch):
+    """Links without a sensor and unfelt objects are in neither inputs nor arrays; one query serves both sensors."""
     assert touch.inputs.bodies == ("item", "pad")
     depth = touch.plan.quantities["contact_depth"]
     assert list(touch.plan.quantities) == ["contact_depth"] and len(depth.queries) == len(depth.uses) == 1
@@ -158,7 +158,7 @@ def test_a_shared_query_costs_once(document):
     assert both - alone < 0.1 * alone
 
 
-def test_explain_names_counts_inputs_and_what_was_dropped(touch):
+def test_explain_names_counts_inputs_and_dropped_parts(touch):
     text = touch.explain()
     for part in (
         "12 taxels",
@@ -175,7 +175,7 @@ def test_explain_names_counts_inputs_and_what_was_dropped(touch):
     assert f"{4 * 12 * (6 + 6 + 1)} bytes of readings" in text
 
 
-def test_float64_constants_are_the_plans_to_the_bit(document):
+def test_float64_constants_equal_the_plans_exactly(document):
     touch = tgdsl.compile(document)
     exact = tgdsl.compile(document, dtype=torch.float64)
     for moved in (touch.double(), tgdsl.compile(document).to(torch.float64), tgdsl.compile(document).double().float().double()):
@@ -202,7 +202,7 @@ def test_parameters_have_gradients(document):
     assert gradient.item() == pytest.approx(difference.item(), rel=1e-9)
 
 
-def test_state_works_under_inference_mode_and_after_it(touch):
+def test_calls_and_resets_work_under_inference_mode_and_after_it(touch):
     state = touch.example_state(2)
     with torch.inference_mode():
         touch(state)
@@ -213,12 +213,12 @@ def test_state_works_under_inference_mode_and_after_it(touch):
     assert touch.num_envs == 2
 
 
-def test_a_cpu_has_no_graphs(touch):
+def test_graphs_need_a_gpu(touch):
     with pytest.raises(TgdslError, match="`graph` needs a module on a GPU, this one is on cpu"):
         touch.compile(graph=True)
 
 
-def test_the_batch_of_a_module_with_state_is_fixed(touch, document):
+def test_a_module_with_state_has_a_fixed_number_of_environments(touch, document):
     assert touch.num_envs is None and touch.has_state
     touch(touch.example_state(3))
     with pytest.raises(StateError, match="this module holds the state of 3 environments, the scene has 4"):
@@ -238,15 +238,15 @@ def test_a_module_can_be_copied_and_pickled(touch):
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda touch: pickle.loads(pickle.dumps(touch))], ids=["deepcopy", "pickle"])
-def test_a_copy_has_constants_of_its_own(document, copied):
-    """A copy that is written into, or moved to another dtype, reads its own constants; the original is left alone."""
+def test_a_copy_has_its_own_constants(document, copied):
+    """A copy that is changed or cast uses its own constants; the original is unchanged."""
     touch, stiffness = tgdsl.compile(document), "sensors/touch/normal_stiffness"
     state = touch.example_state(64)
     expected = touch.peek(state)["touch"]
     assert expected.any()
     exact, other, twice = copied(touch).double(), copied(touch), copied(touch)
     twice.constants[stiffness].mul_(2)
-    pointers = [buffer.data_ptr() for own in (touch, exact, other, twice) for buffer in own.constants.buffers()]
+    pointers = [buffer.data_ptr() for module in (touch, exact, other, twice) for buffer in module.constants.buffers()]
     assert len(set(pointers)) == len(pointers)
     assert torch.equal(touch.peek(state)["touch"], expected)
     assert torch.equal(exact.peek(state)["touch"], tgdsl.compile(document, dtype=torch.float64).peek(state)["touch"])
@@ -269,7 +269,7 @@ def test_state_moves_between_dtypes(touch):
 
 
 class InverseSpec(ContactProbeSpec):
-    """One over one plus depth: a kind that tgdsl does not have."""
+    """The spec of a user's kind, which reads 1 / (1 + depth)."""
 
     kind: Literal["inverse"]
     """The kind."""
@@ -285,7 +285,7 @@ INVERSE = Kind(
 )
 
 
-def test_kinds_of_your_own(document, tmp_path):
+def test_users_kinds_compile_and_load(document, tmp_path):
     document["sensors"] = {"mine": {"kind": "inverse", "links": "pad", "feels": ["item"]}}
     with pytest.raises(SpecError, match='unknown kind "inverse"'):
         tgdsl.compile(document)
@@ -294,9 +294,9 @@ def test_kinds_of_your_own(document, tmp_path):
     tgdsl.save(touch, tmp_path / "mine.safetensors")
     with pytest.raises(TgdslError, match='sensor "mine" is of kind "inverse", which is neither installed nor given as `kinds`'):
         tgdsl.load(tmp_path / "mine.safetensors")
-    again = tgdsl.load(tmp_path / "mine.safetensors", kinds=[INVERSE])
+    loaded = tgdsl.load(tmp_path / "mine.safetensors", kinds=[INVERSE])
     state = touch.example_state(2)
-    torch.testing.assert_close(again(state)["mine"], touch(state)["mine"], rtol=0, atol=0)
+    torch.testing.assert_close(loaded(state)["mine"], touch(state)["mine"], rtol=0, atol=0)
     assert isinstance(TactileModule(touch.plan, (*KINDS, INVERSE)), torch.nn.Module)
 
 
@@ -312,7 +312,7 @@ TILES = {
 
 
 @pytest.mark.parametrize("name", TILES)
-def test_blocks_are_tiles_where_a_taxel_asks_for_little(document, name):
+def test_sensors_with_little_work_per_taxel_use_tiles(document, name):
     sensor, is_tiled = TILES[name]
     document["sensors"] = {"mine": {"links": "pad", "feels": ["item"], **sensor}}
     options = tgdsl.compile(document).inductor_options()
@@ -320,38 +320,38 @@ def test_blocks_are_tiles_where_a_taxel_asks_for_little(document, name):
     assert options == {"assert_indirect_indexing": False, "triton.autotune_pointwise": not is_tiled} | tiles
 
 
-def test_the_number_of_environments_is_the_only_size_that_a_compiled_module_does_not_know(document):
+def test_the_number_of_environments_is_the_only_dynamic_size(document):
     document["sensors"] = {
         "mine": {"links": "pad", "feels": ["item"], "kind": "contact_depth", "noise": {"read_delay": "5 ms"}}
     }
-    touch, unknown = tgdsl.compile(document), []
+    touch, dynamic_sizes = tgdsl.compile(document), []
 
     def keep(graph, inputs):
-        unknown.append([size for size in inputs if isinstance(size, torch.SymInt)])
+        dynamic_sizes.append([size for size in inputs if isinstance(size, torch.SymInt)])
         return graph
 
     touch.compile(backend=keep)
     for num_envs in (5, 11):
         touch.free()
         touch(touch.example_state(num_envs))
-    assert [len(sizes) for sizes in unknown] == [1]
+    assert [len(sizes) for sizes in dynamic_sizes] == [1]
 
 
 @pytest.mark.slow
-def test_as_many_modules_as_one_likes_are_compiled(document):
+def test_any_number_of_modules_can_be_compiled(document):
     sensor = {"kind": "contact_depth", "links": "pad", "feels": ["item"]}
     for count in (1, 2, 3):
         document["sensors"] = {f"depth{i}": sensor for i in range(count)}
         touch, plain = tgdsl.compile(document).compile(backend="eager"), tgdsl.compile(document)
         state = touch.example_state(2)
         with torch._dynamo.config.patch(recompile_limit=2):
-            found, expected = touch(state), plain(state)
-        assert len(found) == count and all(torch.equal(found[name], expected[name]) for name in expected)
+            readings, expected = touch(state), plain(state)
+        assert len(readings) == count and all(torch.equal(readings[name], expected[name]) for name in expected)
 
 
 @pytest.mark.parametrize("dtype", [torch.int64, torch.float16, torch.bfloat16, torch.bool, torch.complex64])
-def test_only_float32_and_float64_are_a_modules(document, touch, tmp_path, dtype):
-    """A bfloat16 knows 4 cm to 0.1 mm, so depths erred by half of full scale; an integer read zeros."""
+def test_only_float32_and_float64_are_accepted(document, touch, tmp_path, dtype):
+    """bfloat16 resolves 4 cm to 0.1 mm, half of the full scale of depths; an integer dtype would read zeros."""
     path = tmp_path / "touch.safetensors"
     tgdsl.save(touch, path)
     refused = pytest.raises(TgdslError, match=rf"^a module cannot be of {dtype}, expected torch\.float32 or torch\.float64; ")
@@ -362,7 +362,7 @@ def test_only_float32_and_float64_are_a_modules(document, touch, tmp_path, dtype
     ):
         with refused:
             make()
-    if dtype not in (torch.int64, torch.bool):  # torch itself casts modules to floating point or complex dtypes alone
+    if dtype not in (torch.int64, torch.bool):  # torch casts modules only to floating point or complex dtypes
         for cast in (lambda: touch.to(dtype), lambda: touch.type(dtype), lambda: torch.nn.Sequential(touch).to(dtype)):
             with warnings.catch_warnings(), refused:
                 warnings.filterwarnings("ignore", "Complex modules")
@@ -370,7 +370,7 @@ def test_only_float32_and_float64_are_a_modules(document, touch, tmp_path, dtype
         assert {b.dtype for b in touch.buffers() if b.is_floating_point()} == {touch.dtype}
 
 
-def test_a_module_is_cast_between_its_dtypes(touch):
+def test_a_module_can_be_cast_to_float64(touch):
     state = touch.example_state(3)
     single = touch(state)["touch"]
     touch.free()
@@ -379,7 +379,7 @@ def test_a_module_is_cast_between_its_dtypes(touch):
     torch.testing.assert_close(single.double(), double, rtol=0, atol=1e-5 * float(double.abs().max()))
 
 
-def test_tables_have_no_tiles(document, tmp_path, monkeypatch):
+def test_tables_use_no_tiles(document, tmp_path, monkeypatch):
     monkeypatch.setenv("TGDSL_CACHE", str(tmp_path))
     wedge = '<asset><mesh name="wedge" vertex="0 -.01 0  0 .01 0  0 -.01 .04  0 .01 .04  .01 -.01 0  .01 .01 0"/></asset>'
     scene = SCENE.replace('<geom type="box" size=".02 .02 .02"/>', '<geom type="mesh" mesh="wedge"/>')
@@ -388,7 +388,7 @@ def test_tables_have_no_tiles(document, tmp_path, monkeypatch):
     assert not tgdsl.compile(document).inductor_options()["triton.prefer_nd_tiling"]
 
 
-def test_the_index_of_a_variant_is_looked_at(document):
+def test_variants_keep_the_check_of_indices(document):
     document["objects"]["item"]["variants"] = [{"type": "sphere", "size": [0.01]}, {"type": "box", "size": [0.01, 0.01, 0.02]}]
     assert tgdsl.compile(document).inductor_options()["assert_indirect_indexing"]
 

@@ -36,13 +36,13 @@ def test_slots_are_enough_for_the_pair_with_the_most_contacts(touch, found):
         touch(state)
 
 
-def test_as_many_contacts_as_slots_are_not_warned_of(touch):
+def test_as_many_contacts_as_slots_give_no_warning(touch):
     state = touch.example_state(3)
     state.contact_found = torch.full((3, 2), 4.0)
     touch(state)
 
 
-def test_a_pair_is_warned_of_once_and_the_other_one_then(touch):
+def test_each_pair_is_warned_of_once(touch):
     state = touch.example_state(3)
     state.contact_found = torch.full((3, 2), 4.0)
     for pair, link in enumerate(pair.link for pair in touch.inputs.pairs):

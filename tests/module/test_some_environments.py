@@ -1,4 +1,4 @@
-"""Reading some environments alone, and looking without advancing anything."""
+"""Reading only some environments, and peeking without advancing any state."""
 
 import copy
 import pickle
@@ -21,7 +21,7 @@ SENSORS = {
     "force": {"kind": "force_taxel"},
     "near": {"kind": "proximity", "backend": "points", "points": 50},
 }
-"""Everything that remembers: filters, delays, rates, windows, bits, markers that stick, points that are held; and what does not."""
+"""All kinds of memory: filters, delays, rates, windows, bits, sticking markers, held points; and sensors without memory."""
 NUM_ENVS = 3
 
 
@@ -45,76 +45,76 @@ def clones(readings):
 
 
 def schedule(seed: int, calls: int):
-    """Yield for each call who was reset before it, and who is read: everyone, or some by mask or index."""
+    """Yield for each call the environments reset before it, those read, and whether a mask selects them."""
     rng = np.random.default_rng(seed)
     for call in range(calls):
         reset = np.flatnonzero(rng.random(NUM_ENVS) < 0.15)
-        read = np.arange(NUM_ENVS) if call == 0 or rng.random() < 0.5 else np.flatnonzero(rng.random(NUM_ENVS) < 0.5)
-        yield reset.tolist(), read.tolist(), bool(rng.random() < 0.5)
+        chosen = np.arange(NUM_ENVS) if call == 0 or rng.random() < 0.5 else np.flatnonzero(rng.random(NUM_ENVS) < 0.5)
+        yield reset.tolist(), chosen.tolist(), bool(rng.random() < 0.5)
 
 
 @pytest.fixture(params=[True, False], ids=["with_grad", "without_grad"])
 def with_grad(request):
-    """With derivatives and without them."""
+    """Run with and without gradients."""
     with torch.set_grad_enabled(request.param):
         yield request.param
 
 
 @pytest.mark.parametrize(("seed", "with_grad"), [(0, True), (1, False), (2, False)], indirect=["with_grad"])
-def test_each_environment_is_as_if_it_were_alone(touch, seed, with_grad):
-    """A batch of which some are read equals modules of one environment each, which are called only when theirs is read."""
+def test_each_environment_equals_a_module_of_one(touch, seed, with_grad):
+    """A batch with some environments read equals single modules that are called only for their environment's reads."""
     alone = [copy.deepcopy(touch).seed(7, first_env=env) for env in range(NUM_ENVS)]
     touch.seed(7)
-    handed: dict[str, torch.Tensor] = {}
-    for call, (reset, read, by_mask) in enumerate(schedule(seed, 25)):
+    last: dict[str, torch.Tensor] = {}
+    for call, (reset, ids, by_mask) in enumerate(schedule(seed, 25)):
         touch.reset(reset)
         for env in reset:
             alone[env].reset()
         state = felt_state(touch, NUM_ENVS, 100 * seed + call)
-        mask = torch.zeros(NUM_ENVS, dtype=torch.bool).index_fill_(0, torch.tensor(read, dtype=torch.int64), True)
-        chosen = {} if len(read) == NUM_ENVS else {"mask": mask} if by_mask else {"env_ids": read}
-        readings = touch(state, **chosen)
+        mask = torch.zeros(NUM_ENVS, dtype=torch.bool).index_fill_(0, torch.tensor(ids, dtype=torch.int64), True)
+        selection = {} if len(ids) == NUM_ENVS else {"mask": mask} if by_mask else {"env_ids": ids}
+        readings = touch(state, **selection)
         for env in range(NUM_ENVS):
-            expected = alone[env](only(state, slice(env, env + 1))) if env in read else None
+            expected = alone[env](only(state, slice(env, env + 1))) if env in ids else None
             for name, reading in readings.items():
                 if expected is None:
-                    assert torch.equal(reading[env], handed[name][env]), (call, env, name)
+                    assert torch.equal(reading[env], last[name][env]), (call, env, name)
                 else:
                     torch.testing.assert_close(reading[env], expected[name][0], rtol=1e-9, atol=1e-15)
-        handed = clones(readings)
+        last = clones(readings)
 
 
-def test_what_is_returned_is_a_copy(touch, with_grad):
-    """Neither a later call nor who writes into readings changes what others hold."""
+def test_readings_are_copies(touch, with_grad):
+    """Neither later calls nor writes into readings change other readings."""
     state = felt_state(touch, NUM_ENVS)
     touch(state)
     first = touch(state, env_ids=[0])
-    kept = clones(first)
+    expected = clones(first)
     for reading in touch(felt_state(touch, NUM_ENVS, 1), env_ids=[1]).values():
         reading.fill_(7.0)
-    again = touch(felt_state(touch, NUM_ENVS, 2), env_ids=[2])
-    assert all(torch.equal(first[name], kept[name]) for name in first)
-    assert not any((reading == 7.0).all() for reading in again.values())
-    assert all(torch.equal(again[name][0], kept[name][0]) for name in again)
+    later = touch(felt_state(touch, NUM_ENVS, 2), env_ids=[2])
+    assert all(torch.equal(first[name], expected[name]) for name in first)
+    assert not any((reading == 7.0).all() for reading in later.values())
+    assert all(torch.equal(later[name][0], expected[name][0]) for name in later)
 
 
-def test_a_look_advances_nothing_and_sees_what_the_next_call_reads(touch):
+def test_peek_advances_nothing_and_equals_the_next_call(touch):
     for call in range(6):
         state = felt_state(touch, NUM_ENVS, call)
         before = clones(touch.state_dict())
-        seen = [clones(touch.peek(state)) for _ in range(2)]
+        peeks = [clones(touch.peek(state)) for _ in range(2)]
         after = touch.state_dict()
         assert before.keys() == after.keys() and all(torch.equal(before[name], after[name]) for name in after)
         if call == 2:
             touch.reset([1])
-            seen = [clones(touch.peek(state))] * 2
-        found = touch(state)
-        for look in seen:
-            assert look.keys() == found.keys() and all(torch.equal(look[name], found[name]) for name in found)
+            peeks = [clones(touch.peek(state))] * 2
+        readings = touch(state)
+        for peek in peeks:
+            assert peek.keys() == readings.keys() and all(torch.equal(peek[name], readings[name]) for name in readings)
     assert touch.num_envs == NUM_ENVS
 
 
-def test_a_look_before_the_first_call_fixes_nothing(touch):
+def test_peek_before_the_first_call_fixes_nothing(touch):
     touch.peek(felt_state(touch, 2))
     assert touch.num_envs is None and not touch.state_dict()
     touch(felt_state(touch, 5))
@@ -124,7 +124,7 @@ def test_a_look_before_the_first_call_fixes_nothing(touch):
 @pytest.mark.slow
 @torch.no_grad()
 def test_compiled_equals_eager(folder):
-    """Rings, filters, walks, windows, held samples, bits: three graphs, of calls, of masked ones and of looks."""
+    """Rings, filters, walks, windows, held samples and bits, in three graphs: calls, masked calls and peeks."""
     noise = {"read_delay": 0.013, "hysteresis": {"strength": 0.5, "time_constant": 0.05}, "drift": 1e-5}
     sensors = {
         "s": {"kind": "contact_depth", "noise": noise, "rate": 60, "history": {"length": 3, "reduce": "mean"}},
@@ -132,22 +132,22 @@ def test_compiled_equals_eager(folder):
     }
     touch = tgdsl.compile(document(folder, sensors))
     eager, compiled = copy.deepcopy(touch).seed(3), touch.seed(3).compile(backend="eager")
-    for call, (reset, read, _) in enumerate(schedule(5, 8)):
+    for call, (reset, ids, _) in enumerate(schedule(5, 8)):
         state = felt_state(eager, NUM_ENVS, call)
-        mask = torch.zeros(NUM_ENVS, dtype=torch.bool).index_fill_(0, torch.tensor(read, dtype=torch.int64), True)
-        found, looked = [], []
+        mask = torch.zeros(NUM_ENVS, dtype=torch.bool).index_fill_(0, torch.tensor(ids, dtype=torch.int64), True)
+        readings, peeks = [], []
         for module in (eager, compiled):
             module.reset(reset)
-            looked.append(clones(module.peek(state)))
-            found.append(clones(module(state) if len(read) == NUM_ENVS else module(state, mask)))
-        for a, b in (found, looked):
+            peeks.append(clones(module.peek(state)))
+            readings.append(clones(module(state) if len(ids) == NUM_ENVS else module(state, mask)))
+        for a, b in (readings, peeks):
             for name in a:
                 torch.testing.assert_close(b[name], a[name], rtol=1e-4, atol=1e-5 * float(a[name].abs().max()) + 1e-12)
 
 
 @pytest.mark.parametrize(("keeps_last", "num_graphs"), [(False, 3), (True, 2)])
-def test_who_keeps_what_is_handed_out_from_the_start_compiles_calls_once(folder, keeps_last, num_graphs):
-    """One graph of calls and one of masked ones; else calls before the first masked one have a graph of their own."""
+def test_with_keeps_last_calls_compile_once(folder, keeps_last, num_graphs):
+    """One graph for calls and one for masked calls; without `keeps_last`, calls before the first masked one have another graph."""
     touch = tgdsl.compile(document(folder, {"d": {"kind": "contact_depth"}}))
     eager, compiled = copy.deepcopy(touch), []
     touch.memory.keeps_last = keeps_last
@@ -155,28 +155,28 @@ def test_who_keeps_what_is_handed_out_from_the_start_compiles_calls_once(folder,
     mask = torch.tensor([True, False, True])
     with torch.no_grad():
         for call in range(6):
-            state, chosen = felt_state(touch, NUM_ENVS, call), {"mask": mask} if call % 2 else {}
-            found = touch(state, **chosen)
-            for name, reading in eager(state, **chosen).items():
-                torch.testing.assert_close(found[name], reading)
+            state, selection = felt_state(touch, NUM_ENVS, call), {"mask": mask} if call % 2 else {}
+            readings = touch(state, **selection)
+            for name, reading in eager(state, **selection).items():
+                torch.testing.assert_close(readings[name], reading)
     assert len(compiled) == num_graphs
 
 
-def test_what_has_room_but_was_not_handed_out_is_asked_for(touch):
-    """Room from the start holds nothing; it takes another batch as the module does."""
+def test_keeps_last_needs_a_whole_call_before_a_masked_one(touch):
+    """Preallocated readings are empty; they follow another number of environments."""
     touch.memory.keeps_last = True
     touch.peek(felt_state(touch, NUM_ENVS))
     for num_envs in (NUM_ENVS, 2):
         with pytest.raises(StateError, match="nothing was handed out yet for the environments left out"):
             touch(felt_state(touch, num_envs), env_ids=[0])
         before = clones(touch(felt_state(touch, num_envs, 1)))
-        found = touch(felt_state(touch, num_envs, 2), env_ids=[0])
-        assert all(torch.equal(found[name][1:], before[name][1:]) for name in found)
+        readings = touch(felt_state(touch, num_envs, 2), env_ids=[0])
+        assert all(torch.equal(readings[name][1:], before[name][1:]) for name in readings)
         touch.free()
 
 
-def test_state_is_loaded_where_it_lies(touch):
-    """A captured graph reads and writes the same tensors before and after; of another number of environments there are others."""
+def test_state_is_loaded_in_place(touch):
+    """Captured graphs keep their tensors; another number of environments gets new ones."""
     source = copy.deepcopy(touch).seed(5)
     for call in range(3):
         source(felt_state(source, NUM_ENVS, call))
@@ -194,33 +194,33 @@ def test_state_is_loaded_where_it_lies(touch):
     assert touch(felt_state(touch, 2))["s"].shape[0] == 2
 
 
-def test_a_sensor_without_memory_takes_a_mask_too(folder, with_grad):
+def test_a_sensor_without_memory_accepts_a_mask(folder, with_grad):
     touch = tgdsl.compile(document(folder, {"d": {"kind": "contact_depth"}}), dtype=torch.float64)
     states = [felt_state(touch, 4, seed) for seed in range(3)]
     first, new = clones(touch(states[0])), touch.peek(states[1])["d"]
-    found = touch(states[1], env_ids=torch.tensor([1, 3]))["d"]
-    assert torch.equal(found[[1, 3]], new[[1, 3]]) and torch.equal(found[[0, 2]], first["d"][[0, 2]])
-    larger = touch(felt_state(touch, 6, 2))["d"]  # it holds no state, so any batch is fine
+    reading = touch(states[1], env_ids=torch.tensor([1, 3]))["d"]
+    assert torch.equal(reading[[1, 3]], new[[1, 3]]) and torch.equal(reading[[0, 2]], first["d"][[0, 2]])
+    larger = touch(felt_state(touch, 6, 2))["d"]  # without state, any batch is fine
     assert torch.equal(touch(felt_state(touch, 6, 3), env_ids=[])["d"], larger)
     with pytest.raises(StateError, match="readings of 6 environments were handed out before, the scene has 4"):
         touch(states[0], env_ids=[1])
 
 
-def test_readings_that_were_written_into_are_not_handed_out_again(folder):
-    """Before the first masked call they are kept where they lie: who writes into them is told, and not given them back."""
+def test_modified_readings_are_not_returned_again(folder):
+    """Before the first masked call they are not copied, so writes into them are an error."""
     touch = tgdsl.compile(document(folder, {"d": {"kind": "contact_depth"}}), dtype=torch.float64)
     touch(felt_state(touch, 3, 0))["d"].mul_(100.0)
     with pytest.raises(StateError, match="the readings d that were handed out last have been written into since"):
         touch(felt_state(touch, 3, 1), env_ids=[1])
     first = touch(felt_state(touch, 3, 2))["d"].clone()
-    found = touch(felt_state(touch, 3, 3), env_ids=[1])["d"]
-    assert torch.equal(found[[0, 2]], first[[0, 2]])
-    found.mul_(100.0)  # from now on they have a place of their own
+    reading = touch(felt_state(touch, 3, 3), env_ids=[1])["d"]
+    assert torch.equal(reading[[0, 2]], first[[0, 2]])
+    reading.mul_(100.0)  # from now on they are copied
     assert torch.equal(touch(felt_state(touch, 3, 4), env_ids=[1])["d"][[0, 2]], first[[0, 2]])
 
 
 @pytest.mark.parametrize("change", ["load", "cast"])
-def test_what_was_handed_out_by_another_state_is_forgotten(touch, change):
+def test_loading_or_casting_forgets_the_last_readings(touch, change):
     touch(felt_state(touch, NUM_ENVS))
     if change == "load":
         touch.load_state_dict(touch.state_dict())
@@ -231,21 +231,21 @@ def test_what_was_handed_out_by_another_state_is_forgotten(touch, change):
 
 
 @pytest.mark.slow
-def test_a_copy_of_a_compiled_module_computes_by_itself(folder):
-    """Its own constants, dtype and memory; the original goes on with its own."""
+def test_a_copy_of_a_compiled_module_is_independent(folder):
+    """The copy has its own constants, dtype and memory."""
     touch = tgdsl.compile(document(folder, {"d": {"kind": "kinematic_taxel", "noise": {"white_noise": 0.1}}}))
     touch.compile(backend="eager", fullgraph=False)
     state = felt_state(touch, 3)
     first = touch(state)["d"].clone()
     for other in (copy.deepcopy(touch), pickle.loads(pickle.dumps(touch))):
         exact = other.double().seed(0)
-        found = exact(state)["d"]
-        assert found.dtype == torch.float64 and other.calls.compiled.keys() == {"advance"}
-        torch.testing.assert_close(found.float(), first, rtol=1e-4, atol=1e-4)
+        reading = exact(state)["d"]
+        assert reading.dtype == torch.float64 and other.calls.compiled.keys() == {"advance"}
+        torch.testing.assert_close(reading.float(), first, rtol=1e-4, atol=1e-4)
     assert touch(state)["d"].dtype == torch.float32 and touch.memory.clock.get_buffer("step").tolist() == [2, 2, 2]
 
 
-def test_state_loaded_under_inference_mode_serves_outside(original):
+def test_state_loaded_under_inference_mode_works_outside(original):
     source, touch = copy.deepcopy(original), copy.deepcopy(original)
     for call in range(3):
         source(felt_state(source, NUM_ENVS, call))
@@ -256,7 +256,7 @@ def test_state_loaded_under_inference_mode_serves_outside(original):
     assert all(torch.equal(reading, expected[name]) for name, reading in touch(state).items())
 
 
-def test_gradients_are_those_of_the_environments_that_are_read(folder):
+def test_gradients_flow_only_from_the_environments_read(folder):
     touch = tgdsl.compile(document(folder, {"d": {"kind": "kinematic_taxel"}}), dtype=torch.float64)
     touch(felt_state(touch, 3, 0))
     state, slopes = felt_state(touch, 3, 1), []
@@ -286,7 +286,7 @@ def test_gradients_are_those_of_the_environments_that_are_read(folder):
         ({"mask": torch.ones(3, dtype=torch.bool), "env_ids": [0]}, "found both `mask` and `env_ids`, expected one of them"),
     ],
 )
-def test_who_is_not_there_is_named_and_nothing_moves(touch, chosen, message):
+def test_invalid_selections_are_named_and_change_nothing(touch, chosen, message):
     state = felt_state(touch, NUM_ENVS)
     touch(state)
     before = clones(touch.state_dict())
@@ -295,16 +295,16 @@ def test_who_is_not_there_is_named_and_nothing_moves(touch, chosen, message):
     assert all(torch.equal(before[name], value) for name, value in touch.state_dict().items())
 
 
-def test_some_alone_need_a_call_before(touch):
+def test_reading_some_environments_needs_a_whole_call_first(touch):
     with pytest.raises(StateError, match="nothing was handed out yet for the environments left out"):
         touch(felt_state(touch, NUM_ENVS), env_ids=[0])
     assert touch.num_envs is None
 
 
-# the number of environments, and what is loaded
+# the number of environments, and loaded states
 
 
-def test_free_lets_go_of_the_batch_and_keeps_the_seed(touch):
+def test_free_forgets_the_batch_and_keeps_the_seed(touch):
     touch.seed(5)
     first = clones(touch(felt_state(touch, 2)))
     with pytest.raises(StateError, match=r"holds the state of 2 environments, the scene has 3; `free\(\)` lets go of it"):
@@ -316,11 +316,11 @@ def test_free_lets_go_of_the_batch_and_keeps_the_seed(touch):
     assert all(torch.equal(reading, first[name]) for name, reading in touch(felt_state(touch, 2)).items())
 
 
-def test_a_seed_between_calls_leaves_rates_as_they_are(folder):
+def test_a_seed_between_calls_does_not_change_rates(folder):
     """A sensor with a rate and no delay takes a sample at every fourth call, before and after."""
     touch = tgdsl.compile(document(folder, {"d": {"kind": "contact_depth", "rate": 25}}), dtype=torch.float64)
 
-    def sampled(seed):
+    def sample_calls(seed):
         changes, last = [], None
         for call in range(12):
             reading = touch(felt_state(touch, 8, call))["d"]
@@ -329,7 +329,7 @@ def test_a_seed_between_calls_leaves_rates_as_they_are(folder):
         touch.seed(seed)
         return changes
 
-    assert sampled(1) == sampled(2) == [True, False, False, False] * 3
+    assert sample_calls(1) == sample_calls(2) == [True, False, False, False] * 3
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -340,8 +340,8 @@ def test_loaded_state_takes_the_modules_dtype(original, dtype):
         source(felt_state(source, NUM_ENVS, call))
     touch.load_state_dict(source.state_dict())
     state = felt_state(touch, NUM_ENVS, 4)
-    found, expected = touch(state), source(state)
-    for name, reading in found.items():
+    readings, expected = touch(state), source(state)
+    for name, reading in readings.items():
         assert reading.dtype == dtype
         torch.testing.assert_close(
             reading.double(), expected[name].double(), rtol=1e-3, atol=1e-4 * float(expected[name].abs().max())
@@ -350,7 +350,7 @@ def test_loaded_state_takes_the_modules_dtype(original, dtype):
 
 @pytest.mark.parametrize("missing", ["memory.clock.age", "memory.s:noise/lag", "memory.history/stack"])
 @pytest.mark.parametrize("strict", [True, False])
-def test_part_of_a_state_is_no_state(original, missing, strict):
+def test_an_incomplete_state_is_refused(original, missing, strict):
     source, touch = copy.deepcopy(original), copy.deepcopy(original)
     source(felt_state(source, NUM_ENVS))
     state = source.state_dict()
@@ -373,7 +373,7 @@ def test_state_of_another_shape_is_named(original):
     assert 'the parts of "memory." are of [2, 3] environments' in str(caught.value)
 
 
-def test_a_state_saved_before_the_first_call_does_not_replace_one(touch):
+def test_an_empty_state_does_not_replace_a_state(touch):
     empty = touch.state_dict()
     touch.load_state_dict(empty)
     touch(felt_state(touch, NUM_ENVS))

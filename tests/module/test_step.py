@@ -1,4 +1,4 @@
-"""The step as a function: memory goes in and comes out, and derivatives go through it."""
+"""The step as a pure function: memory goes in and out, with gradients through it."""
 
 import dataclasses
 
@@ -17,8 +17,8 @@ def noisy(tmp_path):
     return tgdsl.compile(document(tmp_path, NOISY), dtype=torch.float64).seed(7)
 
 
-def test_steps_read_what_calls_read(noisy):
-    """Noise, delays, rates, history and resets; memory of a step is not changed by the next one."""
+def test_steps_read_the_same_as_calls(noisy):
+    """With noise, delays, rates, history and resets; a step does not change its input memory."""
     memory = noisy.initial_memory(4, 0.01)
     for call in range(12):
         state, reset = felt_state(noisy, 4, call), torch.tensor([False, call == 5, call in (3, 4), False])
@@ -34,7 +34,7 @@ def test_steps_read_what_calls_read(noisy):
     assert held.keys() == memory.keys() and all(torch.equal(held[name], memory[name]) for name in held)
 
 
-def test_steps_of_every_kind_read_what_calls_read():
+def test_steps_of_every_kind_read_the_same_as_calls():
     touch = tgdsl.compile(EXAMPLE, resolution="low")
     memory = touch.initial_memory(2, 0.01)
     for call in range(3):
@@ -45,7 +45,7 @@ def test_steps_of_every_kind_read_what_calls_read():
 
 
 @pytest.mark.parametrize(("noise", "history"), [({"read_delay": 0.02}, None), ({}, {"length": 3, "reduce": "mean"})])
-def test_derivatives_go_through_memory(tmp_path, noise, history):
+def test_gradients_flow_through_memory(tmp_path, noise, history):
     """∂(reading two steps later)/∂(position now), against central differences in float64."""
     sensor = {"noise": noise, **({"history": history} if history else {})}
     touch = tgdsl.compile(document(tmp_path, {"a": sensor}), dtype=torch.float64)
@@ -68,7 +68,7 @@ def test_derivatives_go_through_memory(tmp_path, noise, history):
         assert difference.item() == pytest.approx(gradient[place].item(), rel=1e-5, abs=1e-5)
 
 
-def test_memory_that_does_not_fit_is_refused(noisy):
+def test_invalid_memory_is_refused(noisy):
     state, memory = felt_state(noisy, 4), noisy.initial_memory(4, 0.01)
     with pytest.raises(StateError, match="expected `dt`, the time between steps"):
         noisy.initial_memory(4)

@@ -1,4 +1,4 @@
-"""Modules that meet tables, artefacts, rollouts and states of others: the same order passes, another one is refused by name."""
+"""Taxels of modules against those of tables, artefacts, rollouts and states: equal ones pass, others are refused with the difference."""
 
 import json
 from pathlib import Path
@@ -46,17 +46,17 @@ def compiled(folder, points=POINTS, noise="clean") -> tgdsl.TactileModule:
 
 
 def near(points=POINTS):
-    """The same points 1e-8 m away, as after a way through float32."""
+    """Return the same points 1e-8 m away, as after a conversion to float32."""
     return [{**point, "pos": [x + 1e-8 for x in point["pos"]]} for point in points]
 
 
 @pytest.fixture
 def three(tmp_path):
-    """A module, the same one within rounding, and one with two rows swapped."""
+    """Return a module, the same one within rounding, and one with two rows swapped."""
     return compiled(tmp_path), compiled(tmp_path, near()), compiled(tmp_path, [POINTS[i] for i in (0, 2, 1)])
 
 
-def test_modules_and_tables(three):
+def test_taxels_are_checked_against_modules_and_tables(three):
     touch, same, other = three
     tgdsl.check_taxels(touch, same)
     tgdsl.check_taxels(touch, same.taxels)
@@ -68,12 +68,12 @@ def test_modules_and_tables(three):
         tgdsl.check_taxels(touch, {"tuch": touch.taxels["touch"]})
 
 
-def test_columns_are_taken_by_torch(tmp_path):
+def test_torch_accepts_columns_of_the_table(tmp_path):
     normals = compiled(tmp_path).taxels["touch"]["normal"]
     assert torch.equal(torch.tensor(normals), torch.tensor([[0.0, 0.0, 1.0]] * 3, dtype=torch.float64))
 
 
-def test_ids_tell_other_taxels_apart_but_no_rounding(three):
+def test_ids_distinguish_taxels_but_ignore_rounding(three):
     touch, same, other = three
     tgdsl.check_taxels(touch, touch.taxels_id)
     tgdsl.check_taxels(touch, same.taxels_id)
@@ -83,12 +83,12 @@ def test_ids_tell_other_taxels_apart_but_no_rounding(three):
 
 
 @pytest.mark.parametrize("expected", ["half a name", "no.txt", {"touch": {"pos": np.zeros((3, 3))}}, "missing.npz"])
-def test_what_is_no_table_is_refused(three, expected):
+def test_invalid_tables_are_refused(three, expected):
     with pytest.raises(TgdslError, match="expected"):
         tgdsl.check_taxels(three[0], expected)
 
 
-def test_artefacts(three, tmp_path):
+def test_taxels_are_checked_against_artefacts(three, tmp_path):
     touch = three[0]
     for name, module in zip(("touch", "same", "other"), three, strict=True):
         tgdsl.save(module, tmp_path / f"{name}.safetensors")
@@ -103,13 +103,13 @@ def test_artefacts(three, tmp_path):
     assert str(caught.value) == str(path) + OTHER_ORDER
 
 
-def test_a_plan_with_an_id_of_an_older_version_is_read(three):
+def test_a_plan_with_an_older_id_is_read(three):
     plan = three[0].plan
     text = plan.to_json().replace(plan.taxels_id, "0" * 32)
     assert type(plan).from_json(text, plan.arrays).taxels_id == plan.taxels_id
 
 
-def test_rollouts(three, tmp_path):
+def test_taxels_are_checked_against_rollouts(three, tmp_path):
     touch, same, other = three
     for name, module in (("same", same), ("other", other)):
         sim = tgdsl.simulate(module, 1)
@@ -125,37 +125,37 @@ def test_rollouts(three, tmp_path):
 
 
 @pytest.mark.parametrize("noise", ["clean", "noisy"])
-def test_states_through_a_file(tmp_path, noise):
-    """With or without state, in a policy that has the module for a part, and with `weights_only`, torch's own default."""
+def test_taxels_are_checked_when_a_state_is_loaded(tmp_path, noise):
+    """With and without state, in a policy that contains the module, and with `weights_only`, torch's default."""
 
     class Policy(nn.Module):
         def __init__(self, touch: tgdsl.TactileModule):
             super().__init__()
             self.touch, self.layer = touch, nn.Linear(9, 2)
 
-    one, same, other = (Policy(compiled(tmp_path, points, noise)) for points in (POINTS, near(), POINTS[::-1]))
-    state = one.touch.example_state(2)
-    one.touch(state)
-    torch.save(one.state_dict(), tmp_path / "policy.pt")
+    policy, same, other = (Policy(compiled(tmp_path, points, noise)) for points in (POINTS, near(), POINTS[::-1]))
+    state = policy.touch.example_state(2)
+    policy.touch(state)
+    torch.save(policy.state_dict(), tmp_path / "policy.pt")
     saved = torch.load(tmp_path / "policy.pt", weights_only=True)
-    assert set(saved) - set(one.state_dict()) == set()
+    assert set(saved) - set(policy.state_dict()) == set()
     same.load_state_dict(saved)
-    assert same.touch.num_envs == one.touch.num_envs
+    assert same.touch.num_envs == policy.touch.num_envs
     with pytest.raises(TaxelError, match=r'^the state dict is of another module: sensor "touch": 2 of 3 rows'):
         other.load_state_dict(saved)
     assert other.touch.num_envs is None
     with pytest.raises(TaxelError, match="the state dict is of another module"):
-        other.touch.load_state_dict(one.touch.state_dict())
-    other.load_state_dict(dict(saved))  # a plain dictionary says nothing of taxels
+        other.touch.load_state_dict(policy.touch.state_dict())
+    other.load_state_dict(dict(saved))  # a plain dictionary has no taxels
 
 
-def test_connections(three, monkeypatch):
+def test_taxels_are_checked_when_connecting(three, monkeypatch):
     touch, same, other = three
     with tgdsl.connect(touch, "simulation", taxels=same, control_step=0.004) as source:
         source.step()
         assert source.observe()["policy"].shape == (1, 9)
     with pytest.raises(TaxelError) as caught:
-        tgdsl.connect(touch, "xhand1:/dev/nowhere", taxels=other.taxels)  # the port is not looked for
+        tgdsl.connect(touch, "xhand1:/dev/nowhere", taxels=other.taxels)  # the port is not opened
     assert str(caught.value) == "this module" + OTHER_ORDER
 
 
@@ -173,8 +173,8 @@ URDF = """<robot name="hand"><link name="palm"><collision><geometry><box size=".
 
 
 @pytest.mark.parametrize(("name", "text"), [("hand.xml", HAND), ("hand.urdf", URDF)])
-def test_a_robot_that_was_exported_has_the_same_taxels(tmp_path, name, text):
-    """USD keeps frames and vertices in float32; the proposed layout samples the surfaces of both."""
+def test_an_exported_robot_has_the_same_taxels(tmp_path, name, text):
+    """USD stores frames and vertices in float32; the proposed layout samples the surfaces of both."""
     (tmp_path / name).write_text(text)
     export_model(tmp_path / name, tmp_path / "twin.usda")
     robot = load_model(tmp_path / name)
@@ -196,7 +196,7 @@ def test_a_robot_that_was_exported_has_the_same_taxels(tmp_path, name, text):
 
 
 class Marker:
-    """Leaves a file behind where it is unpickled."""
+    """Writes a file when it is unpickled."""
 
     def __init__(self, path):
         self.path = path
@@ -205,7 +205,7 @@ class Marker:
         return open, (str(self.path), "w")
 
 
-def test_a_rollout_runs_no_code_of_who_wrote_it(three, tmp_path):
+def test_a_rollout_cannot_run_code(three, tmp_path):
     tables = {"touch:pos": np.array([Marker(tmp_path / "ran")], dtype=object), "touch:link": np.array(["pad"])}
     np.savez(tmp_path / "evil.npz", **tables, allow_pickle=True)
     with pytest.raises(TgdslError, match=r"evil\.npz: expected the \.npz file of a rollout"):

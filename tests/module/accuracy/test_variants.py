@@ -1,4 +1,4 @@
-"""Which variants of a sensor are what a document says, and which `accuracy` may choose."""
+"""Which variants of a sensor match the document, and which `accuracy` may choose."""
 
 from typing import Literal
 
@@ -21,7 +21,7 @@ SDF, RAYCAST = Alternative("sdf", {"query": "sdf"}), Alternative("raycast", {"qu
 DEPTH = next(kind for kind in KINDS if kind.name == "contact_depth")
 
 
-def of(**queries: Query):
+def variants_with(**queries: Query):
     return variants_of(
         DEPTH,
         "skin",
@@ -31,18 +31,21 @@ def of(**queries: Query):
     )
 
 
-def test_a_way_is_the_documents_where_all_objects_have_it():
-    """With a bowl by rays and a cup by a grid the document says neither."""
-    assert [way.is_own for way in of(cup=Query(), bowl=Query()).queries] == [True, False]
-    assert [way.is_own for way in of(cup=Query(), bowl=Query(query="raycast")).queries] == [False, False]
-    assert of(cup=Query()).queries[1].changes == {"objects.cup.query": "raycast"}
-    assert of(cup=Query(), bowl=Query()).queries[1].changes == {"objects.cup.query": "raycast", "objects.bowl.query": "raycast"}
+def test_a_query_is_the_documents_if_all_objects_use_it():
+    """With a bowl by rays and a cup by a grid, it is neither."""
+    assert [way.is_own for way in variants_with(cup=Query(), bowl=Query()).queries] == [True, False]
+    assert [way.is_own for way in variants_with(cup=Query(), bowl=Query(query="raycast")).queries] == [False, False]
+    assert variants_with(cup=Query()).queries[1].changes == {"objects.cup.query": "raycast"}
+    assert variants_with(cup=Query(), bowl=Query()).queries[1].changes == {
+        "objects.cup.query": "raycast",
+        "objects.bowl.query": "raycast",
+    }
 
 
-def test_the_document_is_named_by_its_own_ways():
-    assert of(cup=Query()).own.label == "sdf"
-    assert of(cup=Query(), bowl=Query(query="raycast")).own.label == "as written"
-    assert of(cup=Query()).own.is_own
+def test_the_documents_variant_has_the_label_of_its_query():
+    assert variants_with(cup=Query()).own.label == "sdf"
+    assert variants_with(cup=Query(), bowl=Query(query="raycast")).own.label == "as written"
+    assert variants_with(cup=Query()).own.is_own
 
 
 @pytest.mark.parametrize(
@@ -51,17 +54,17 @@ def test_the_document_is_named_by_its_own_ways():
         ({}, {"sdf", "raycast"}),
         ({"query": "sdf"}, {"sdf"}),
         ({"query": "raycast"}, {"raycast"}),
-        ({"spacing": 0.001}, {"sdf"}),  # which rays have no use for
+        ({"spacing": 0.001}, {"sdf"}),  # which rays do not use
         ({"query": "raycast", "spacing": 0.001}, set()),
     ],
 )
-def test_what_is_written_is_not_changed(written, free):
+def test_values_of_the_document_are_not_changed(written, free):
     spec = Query.model_validate(written)
-    assert {own.label for own in (SDF, RAYCAST) if is_free(spec, own)} == free
+    assert {alternative.label for alternative in (SDF, RAYCAST) if is_free(spec, alternative)} == free
     assert written_of(spec, (SDF, RAYCAST)) == sorted(written)
 
 
-def test_what_reads_otherwise_is_never_chosen_but_may_be_written():
+def test_an_alternative_with_other_readings_is_never_chosen_but_may_be_written():
     other = Alternative("rays", {"query": "raycast"}, is_other=True)
     assert not is_free(Query(), other)
     assert is_free(Query(query="raycast"), other) and is_taken(Query(query="raycast"), other)

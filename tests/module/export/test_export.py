@@ -1,4 +1,4 @@
-"""Exported steps: the file computes what the module computes, for any number of environments, where tgdsl is not."""
+"""Exported steps: the file computes the same as the module, for any number of environments, without tgdsl."""
 
 import contextlib
 import dataclasses
@@ -48,7 +48,7 @@ def noisy(tmp_path):
 
 @pytest.fixture(scope="module")
 def brief(tmp_path_factory):
-    """A module with random numbers, rings and clocks in few operations, the file the command exports, and what it prints."""
+    """Return a small module with random numbers, rings and clocks, its exported file, and the command's output."""
     folder = tmp_path_factory.mktemp("brief")
     noise = {"read_delay": 0.013, "gain": [0.8, 1.2]}
     (folder / "hand.yaml").write_text(json.dumps(document(folder, {"a": {"noise": noise}}), default=float))
@@ -58,13 +58,13 @@ def brief(tmp_path_factory):
 
 
 def of_kinds(folder: Path, *names: str) -> tgdsl.TactileModule:
-    """Return a module of some sensors of `every_kind`, without noise."""
+    """Return a module with some sensors of `every_kind`, without noise."""
     sensors = {name: {key: value for key, value in EVERY_KIND[name].items() if key != "noise"} for name in names}
     return every_kind(folder, sensors)
 
 
-def test_a_file_computes_what_the_module_computes(noisy, tmp_path):
-    """Noise of all sorts, delays, rates, histories, observations, resets; batches of 1, 7 and 64; no tgdsl to import."""
+def test_a_file_computes_the_same_as_the_module(noisy, tmp_path):
+    """All kinds of noise, delays, rates, histories, observations and resets; batches of 1, 7 and 64; without importing tgdsl."""
     noisy(felt_state(noisy))
     signature = noisy.export(tmp_path / "hand.pt2", dt=0.01)
     assert noisy.num_envs == 4, "the module stays as it is"
@@ -77,7 +77,7 @@ def test_a_file_computes_what_the_module_computes(noisy, tmp_path):
         Verify(tmp_path / "hand.pt2").run()
 
 
-def test_other_random_numbers_are_noticed(brief):
+def test_other_random_numbers_are_detected(brief):
     touch, file, _ = brief
     other = verify(file, tgdsl.TactileModule(touch.plan).seed(12), num_calls=3)
     assert other.worst > 0.01 and not other.is_equal
@@ -87,23 +87,23 @@ def test_inputs_that_do_not_fit_are_refused(brief):
     _, file, _ = brief
     signature = read_signature(file)
     program = torch.export.load(file).module()
-    given = [torch.zeros(5, *port.shape, dtype=getattr(torch, port.dtype)) for port in signature.inputs]
-    assert len(program(*given)) == len(signature.outputs)
-    for i, tensor in enumerate(given):
+    inputs = [torch.zeros(5, *port.shape, dtype=getattr(torch, port.dtype)) for port in signature.inputs]
+    assert len(program(*inputs)) == len(signature.outputs)
+    for i, tensor in enumerate(inputs):
         for wrong in (tensor.to(torch.float64), tensor[:3]):
             with pytest.raises((RuntimeError, AssertionError)):
-                program(*given[:i], wrong, *given[i + 1 :])
+                program(*inputs[:i], wrong, *inputs[i + 1 :])
 
 
 @pytest.mark.slow
-def test_states_in_double_precision(tmp_path):
+def test_states_may_be_in_double_precision(tmp_path):
     touch = tgdsl.compile(document(tmp_path, {"a": {}}))
     signature = touch.export(tmp_path / "hand.pt2", dt=0.01, state_dtype="float64")
     assert {port.name: port.dtype for port in signature.inputs}["body_pos"] == "float64"
     assert verify(tmp_path / "hand.pt2", touch, num_calls=3).is_equal
 
 
-def test_what_cannot_be_exported_is_refused_by_name(brief, tmp_path):
+def test_unsupported_exports_are_refused(brief, tmp_path):
     import trimesh
 
     noisy, _, _ = brief
@@ -119,7 +119,7 @@ def test_what_cannot_be_exported_is_refused_by_name(brief, tmp_path):
     assert not (tmp_path / "hand.pt2").exists()
 
 
-def test_files_of_others_and_of_other_taxels_are_refused(brief, tmp_path):
+def test_foreign_and_damaged_files_and_other_taxels_are_refused(brief, tmp_path):
     _, file, _ = brief
     (tmp_path / "text.pt2").write_text("no archive")
     with zipfile.ZipFile(tmp_path / "empty.pt2", "w"):
@@ -142,7 +142,7 @@ def test_files_of_others_and_of_other_taxels_are_refused(brief, tmp_path):
 
 
 def test_the_commands_export_and_verify(brief, capsys, monkeypatch):
-    """The module that the command compares with the file is that of the document it was exported from."""
+    """`verify` compares the file with the document that it was exported from."""
     touch, file, printed = brief
     assert "in    0  body_pos                          float32  (env, 3, 3)" in printed
     assert "tgdsl verify hand.pt2" in printed
@@ -171,7 +171,7 @@ def test_every_kind_is_exported(tmp_path):
 @needs_onnx
 @pytest.mark.filterwarnings(ONNX_NOISE)
 @pytest.mark.parametrize("name", ["noisy", "force", "heat", "skin"])
-def test_onnx_runtime_computes_what_the_module_computes(name, request, tmp_path):
+def test_onnx_runtime_computes_the_same_as_the_module(name, request, tmp_path):
     touch = request.getfixturevalue("noisy") if name == "noisy" else of_kinds(tmp_path, name)
     touch.export(tmp_path / "hand.onnx", dt=0.01)
     assert verify(tmp_path / "hand.onnx", touch, num_calls=10).is_equal
@@ -180,19 +180,19 @@ def test_onnx_runtime_computes_what_the_module_computes(name, request, tmp_path)
 @pytest.mark.slow
 @needs_compiler
 @pytest.mark.filterwarnings(ONNX_NOISE)
-def test_a_compiled_package_computes_what_the_module_computes_in_python_and_in_cpp(tmp_path):
-    """Generating the package takes most of the time, so one serves both; examples/cpp is built here."""
+def test_a_compiled_package_computes_the_same_in_python_and_cpp(tmp_path):
+    """Generating a package is slow, so one test serves both; it builds examples/cpp."""
     noise = {"gain": [0.8, 1.2], "read_delay": 0.013, "white_noise": 2e-4}
     touch = tgdsl.compile(document(tmp_path, {"a": {"kind": "contact_depth", "noise": noise, "history": 3}})).seed(11)
     signature = touch.export(tmp_path / "hand.aoti.pt2", dt=0.01)
     assert verify(tmp_path / "hand.aoti.pt2", touch, num_calls=10).is_equal
     program = torch._inductor.aoti_load_package(str(tmp_path / "hand.aoti.pt2"))
-    given = [torch.zeros(5, *port.shape, dtype=getattr(torch, port.dtype)) for port in signature.inputs]
-    assert len(program(*given)) == len(signature.outputs)
-    for i, tensor in enumerate(given):
+    inputs = [torch.zeros(5, *port.shape, dtype=getattr(torch, port.dtype)) for port in signature.inputs]
+    assert len(program(*inputs)) == len(signature.outputs)
+    for i, tensor in enumerate(inputs):
         for wrong in (tensor.to(torch.float64), tensor[:3]):
             with pytest.raises(RuntimeError):
-                program(*given[:i], wrong, *given[i + 1 :])
+                program(*inputs[:i], wrong, *inputs[i + 1 :])
     build = ["cmake", "-S", str(ROOT / "examples" / "cpp"), "-B", str(tmp_path / "build")]
     subprocess.run([*build, f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"], check=True, capture_output=True)
     subprocess.run(["cmake", "--build", str(tmp_path / "build")], check=True, capture_output=True)
@@ -202,15 +202,15 @@ def test_a_compiled_package_computes_what_the_module_computes_in_python_and_in_c
         state = dataclasses.replace(felt_state(touch, num_envs, call).to(torch.float32), dt=0.01)
         state.contact_found = state.contact_found > 0
         reset = torch.arange(num_envs) == call
-        given = {**touch.incoming.tensors(state, touch.dtype, touch.device), "reset": reset}
+        inputs = {**touch.incoming.tensors(state, touch.dtype, touch.device), "reset": reset}
         for port in signature.inputs:
             if not port.name.startswith("memory/"):
                 file = tmp_path / f"{call}_{port.name.replace('/', '_')}.bin"
-                file.write_bytes(given[port.name].contiguous().numpy().tobytes())
+                file.write_bytes(inputs[port.name].contiguous().numpy().tobytes())
         readings, memory = touch.step(state, memory, reset)
         lines.append(readings["a"].flatten().numpy())
     command = [str(tmp_path / "build" / "touch"), str(tmp_path / "hand.aoti.pt2"), str(tmp_path), str(num_envs), "5"]
     subprocess.run(command, check=True, capture_output=True)
-    found = np.fromfile(tmp_path / "reading_a.bin", np.float32)
+    readings_cpp = np.fromfile(tmp_path / "reading_a.bin", np.float32)
     expected = np.concatenate(lines)
-    assert np.abs(found - expected).max() <= 1e-5 * np.abs(expected).max()
+    assert np.abs(readings_cpp - expected).max() <= 1e-5 * np.abs(expected).max()
