@@ -1,4 +1,4 @@
-"""Adapters are tested against the simulators themselves, each in an environment of its own: `make test-adapters`."""
+"""Adapters are tested with the real simulators, each in a separate environment: `make test-adapters`."""
 
 from importlib.util import find_spec
 

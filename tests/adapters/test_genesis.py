@@ -1,4 +1,4 @@
-"""Touch in Genesis, by the lines of the page: readings are those of plain MuJoCo where its links are, forces are its own."""
+"""Touch in Genesis by the documentation's code: readings match plain MuJoCo in the same pose, forces are Genesis's."""
 
 import json
 import re
@@ -13,7 +13,7 @@ import tgdsl
 from tgdsl.quantities.pairs import Pair
 
 
-def test_the_lines_of_the_page_read_touch(tmp_path, monkeypatch):
+def test_the_documented_code_reads_touch(tmp_path, monkeypatch):
     page = (Path(__file__).parents[2] / "docs" / "how-to" / "genesis.md").read_text(encoding="utf-8")
     lines = re.search(r"^```python\n(import torch\nimport tgdsl\n.*?)^```$", page, flags=re.M | re.S)[1]
     monkeypatch.chdir(tmp_path)
@@ -32,7 +32,7 @@ def test_the_lines_of_the_page_read_touch(tmp_path, monkeypatch):
     names = {"scene": scene}
     exec(lines, names)
     touch, readings = names["touch"], names["readings"]
-    near = FREE.replace("<worldbody>", '<default><geom margin=".001"/></default><worldbody>')  # contacts as Genesis has them
+    near = FREE.replace("<worldbody>", '<default><geom margin=".001"/></default><worldbody>')  # contacts like Genesis's
     model, datas = mujoco.MjModel.from_xml_string(near), []
     pos, quat = solver.get_links_pos(), solver.get_links_quat()
     vel, ang = solver.get_links_vel(), solver.get_links_ang()
@@ -53,7 +53,7 @@ def test_the_lines_of_the_page_read_touch(tmp_path, monkeypatch):
         scale = float(expected[..., part].abs().max())
         assert float((readings["skin"][..., part] - expected[..., part]).abs().max()) <= 1e-6 * scale
     hand, palm = scene.entities[0], touch.inputs.pairs.index(Pair("palm", "cube"))
-    own = hand.get_links_net_contact_force()[:, [link.name for link in hand.links].index("palm")]
-    assert own.abs().max() > 0.5
+    genesis_force = hand.get_links_net_contact_force()[:, [link.name for link in hand.links].index("palm")]
+    assert genesis_force.abs().max() > 0.5
     net = names["state"]().contact_netforce[:, palm]
-    np.testing.assert_allclose(net, own, atol=1e-6 * float(own.abs().max()))
+    np.testing.assert_allclose(net, genesis_force, atol=1e-6 * float(genesis_force.abs().max()))

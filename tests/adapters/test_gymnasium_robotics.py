@@ -1,4 +1,4 @@
-"""Touch on the Shadow hand of gymnasium-robotics, by the lines of the page: loads are MuJoCo's own contact forces."""
+"""Touch on gymnasium-robotics' Shadow hand by the documentation's code: loads are MuJoCo's contact forces."""
 
 import re
 from pathlib import Path
@@ -9,7 +9,7 @@ import numpy as np
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "adapters.md"
 
 
-def test_the_lines_of_the_page_read_touch(tmp_path, monkeypatch):
+def test_the_documented_code_reads_touch(tmp_path, monkeypatch):
     section = PAGE.read_text(encoding="utf-8").split("## gymnasium-robotics")[1]
     document, lines = (re.search(rf"```{language}\n(.*?)```", section, flags=re.S)[1] for language in ("yaml", "python"))
     monkeypatch.chdir(tmp_path)

@@ -1,6 +1,6 @@
-"""Touch in Isaac Lab's contract for sensors, over Newton itself: Isaac Lab is not installed, a stand-in keeps its contract.
+"""Touch by Isaac Lab's contract for sensors, on Newton; a stand-in replaces Isaac Lab.
 
-The stand-in has what the adapter takes of Isaac Lab: `SensorBase` (timestamps and flags per environment, lazy data), `configclass`
+The stand-in has the parts that the adapter uses: `SensorBase` (timestamps and flags per environment, lazy data), `configclass`
 and the accessors of `NewtonManager`.
 """
 
@@ -29,7 +29,7 @@ class BaseCfg:
 
 
 class Base:
-    """Readings are evaluated when asked for, in the environments whose period has passed since they last were, or were reset."""
+    """Evaluate readings on access, in environments whose period has passed or that were reset."""
 
     def __init__(self, cfg):
         self.cfg, self.is_initialized = cfg, False
@@ -119,7 +119,7 @@ def steps(sensor, num, dt=0.002) -> None:
         sensor.update(dt)
 
 
-def test_readings_are_those_of_newtons_sensor(isaaclab, tmp_path):
+def test_readings_match_newtons_sensor(isaaclab, tmp_path):
     doc = document(tmp_path, load=LOAD)
     sensor = make(isaaclab, doc)
     assert Manager.asked == ["/World/envs/env_.*/Robot/.*"]
@@ -132,7 +132,7 @@ def test_readings_are_those_of_newtons_sensor(isaaclab, tmp_path):
     assert torch.equal(sensor.observation(), sensor.tactile.touch.observe(expected)["policy"])
 
 
-def test_sensors_advance_once_a_step_with_the_time_since_they_were_read(isaaclab, tmp_path):
+def test_sensors_advance_by_the_time_since_their_last_read(isaaclab, tmp_path):
     sensor = make(isaaclab, document(tmp_path, delayed=DEPTH | {"noise": {"read_delay": 0.004}}))
     calls, read = [], sensor.tactile.touch.forward
     sensor.tactile.touch.forward = lambda state, mask: calls.append((state.dt, mask)) or read(state, mask)
@@ -143,22 +143,22 @@ def test_sensors_advance_once_a_step_with_the_time_since_they_were_read(isaaclab
     assert calls == [(pytest.approx(0.002), None), (pytest.approx(0.006), None)]
 
 
-def test_an_environment_that_is_reset_is_read_alone(isaaclab, tmp_path):
+def test_only_a_reset_environment_is_read_again(isaaclab, tmp_path):
     sensor = make(isaaclab, document(tmp_path, stacked=DEPTH | {"history": 3}, load=LOAD))
     Manager.host.push()
     for _ in range(4):
         steps(sensor, 1)
-        before = {name: value.clone() for name, value in sensor.data.items()}
+        previous = {name: value.clone() for name, value in sensor.data.items()}
     for reset in ({"env_ids": [1]}, {"env_mask": wp.array([False, True], dtype=wp.bool)}):
         sensor.reset(**reset)
-        after = {name: value.clone() for name, value in sensor.data.items()}
-        assert torch.equal(after["stacked"][0], before["stacked"][0])
-        assert not after["stacked"][1].any() and not after["load"][1].any() and after["load"][0].any()
+        current = {name: value.clone() for name, value in sensor.data.items()}
+        assert torch.equal(current["stacked"][0], previous["stacked"][0])
+        assert not current["stacked"][1].any() and not current["load"][1].any() and current["load"][0].any()
     steps(sensor, 1)
     assert sensor.data["load"][1].any()
 
 
-def test_a_period_leaves_readings_as_they_were(isaaclab, tmp_path):
+def test_readings_stay_within_their_update_period(isaaclab, tmp_path):
     sensor = make(isaaclab, document(tmp_path), update_period=0.004)
     Manager.host.push()
     _ = sensor.data
@@ -170,7 +170,7 @@ def test_a_period_leaves_readings_as_they_were(isaaclab, tmp_path):
     assert not torch.equal(values[2], values[3])
 
 
-def test_a_name_that_the_scene_lacks_fails_when_the_sensor_is_initialized(isaaclab, tmp_path):
+def test_an_unknown_name_is_refused_when_the_sensor_is_initialized(isaaclab, tmp_path):
     message = 'the scene has no body "hand/worldbody/palm/pda"; did you mean "hand/worldbody/palm/pad"?'
     with pytest.raises(Exception, match=re.escape(message)):
         make(isaaclab, document(tmp_path), names={"pad": "hand/worldbody/palm/pda"})

@@ -1,4 +1,4 @@
-"""Datasets, as lerobot, mcap and zarr read them: every number is that of the episodes."""
+"""Datasets read by lerobot, mcap and zarr hold every number of the episodes."""
 
 import json
 import sys
@@ -11,7 +11,7 @@ from small_tasks import small_task
 
 try:
     import torchvision  # noqa: F401
-except RuntimeError:  # its operations are built for torch with CUDA; lerobot calls none of them
+except RuntimeError:  # built for torch with CUDA; lerobot does not call its operations
     for name in ("nms", "qnms"):
         torch.library.define(f"torchvision::{name}", "(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
 import zarr
@@ -21,7 +21,7 @@ from mcap.reader import make_reader
 from tgdsl.rl.datasets.dataset import Episode, Header, LinkTaxels, frames, write_lerobot, write_mcap, write_zarr
 
 
-def made_up():
+def made_up_episodes():
     rng = np.random.default_rng(0)
     links = {"tip": LinkTaxels("tip", rng.normal(size=(4, 3)), rng.normal(size=(4, 3))), "palm": LinkTaxels("palm")}
     header = Header("made up", "press it", ("a", "b"), links, "N", 0.01, 50.0, True, True)
@@ -35,12 +35,14 @@ def made_up():
 
 
 def test_lerobot_reads_every_frame(tmp_path):
-    header, episodes = made_up()
+    header, episodes = made_up_episodes()
     assert write_lerobot(header, episodes, tmp_path) == (3, 16 + 6 + 12)
     dataset = LeRobotDataset("local/touch", root=tmp_path)
     assert (dataset.num_episodes, dataset.num_frames, dataset.fps) == (3, 34, 50)
-    each = [frames(header, episode) for episode in episodes]
-    expected = {name: np.concatenate([own[name] for own in each]) for name in each[0]}
+    frames_of_episodes = [frames(header, episode) for episode in episodes]
+    expected = {
+        name: np.concatenate([episode_frames[name] for episode_frames in frames_of_episodes]) for name in frames_of_episodes[0]
+    }
     assert expected["observation.tactile_window.tip"].shape == (34, 2, 4, 3)
     for i in range(34):
         item = dataset[i]
@@ -54,38 +56,40 @@ def test_lerobot_reads_every_frame(tmp_path):
         np.testing.assert_allclose(stats["mean"], values.mean(axis=0, dtype=float, keepdims=values.ndim == 1), atol=1e-6)
         np.testing.assert_allclose(stats["std"], values.astype(float).std(axis=0, keepdims=values.ndim == 1), atol=1e-6)
         np.testing.assert_allclose(stats["max"], values.max(axis=0, keepdims=values.ndim == 1), atol=1e-6)
-    before = LeRobotDataset("local/touch", root=tmp_path, delta_timestamps={"observation.tactile.tip": [-0.02, 0.0]})
-    np.testing.assert_array_equal(before[20]["observation.tactile.tip"], expected["observation.tactile.tip"][19:21])
+    with_history = LeRobotDataset("local/touch", root=tmp_path, delta_timestamps={"observation.tactile.tip": [-0.02, 0.0]})
+    np.testing.assert_array_equal(with_history[20]["observation.tactile.tip"], expected["observation.tactile.tip"][19:21])
     tactile = json.loads((tmp_path / "meta/tactile.json").read_text())
     assert tactile["unit"] == "N" and tactile["links"]["palm"]["pos"] is None
     np.testing.assert_array_equal(tactile["links"]["tip"]["normal"], header.links["tip"].normal)
 
 
 def test_zarr_reads_every_frame(tmp_path):
-    header, episodes = made_up()
+    header, episodes = made_up_episodes()
     assert write_zarr(header, episodes, tmp_path / "store") == (3, 34)
     root = zarr.open_group(str(tmp_path / "store"), mode="r")
-    each = [frames(header, episode) for episode in episodes]
-    for name in each[0]:
-        np.testing.assert_array_equal(root["data"][name][:], np.concatenate([own[name] for own in each]))
+    frames_of_episodes = [frames(header, episode) for episode in episodes]
+    for name in frames_of_episodes[0]:
+        np.testing.assert_array_equal(
+            root["data"][name][:], np.concatenate([episode_frames[name] for episode_frames in frames_of_episodes])
+        )
     assert root["meta/episode_ends"][:].tolist() == [16, 22, 34] and root["meta/success"][:].tolist() == [1.0, 0.0, 1.0]
     np.testing.assert_array_equal(root["meta/tactile/tip/pos"][:], header.links["tip"].pos)
     assert root.attrs["fps"] == 50.0
 
 
 def test_mcap_reads_every_frame(tmp_path):
-    header, episodes = made_up()
+    header, episodes = made_up_episodes()
     assert write_mcap(header, episodes, tmp_path) == (3, 34)
-    each = [frames(header, episode) for episode in episodes]
+    frames_of_episodes = [frames(header, episode) for episode in episodes]
     starts = (0.0, 16 / 50 + 1.0, 22 / 50 + 2.0)
     with (tmp_path / "episodes.mcap").open("rb") as file:
         reader = make_reader(file)
-        for name in each[0]:
+        for name in frames_of_episodes[0]:
             messages = [m for *_, m in reader.iter_messages(topics=[f"/{name.replace('.', '/')}"])]
             assert len(messages) == 34
             for message in messages:
                 content = json.loads(message.data)
-                value = each[content["episode"]][name][message.sequence]
+                value = frames_of_episodes[content["episode"]][name][message.sequence]
                 np.testing.assert_array_equal(np.asarray(content["value"], value.dtype), value)
                 assert message.log_time == pytest.approx(1e9 * (starts[content["episode"]] + message.sequence / 50), abs=2)
         (tactile,) = reader.iter_metadata()
@@ -116,7 +120,7 @@ def test_a_task_and_a_recording_become_datasets(tmp_path, here):
     assert code == 2 and "run.zarr: is there already; remove it, or name another folder with --out" in error
 
 
-def test_what_fails_leaves_nothing_behind(tmp_path, here, monkeypatch):
+def test_a_failed_export_leaves_no_files(tmp_path, here, monkeypatch):
     write_log(tmp_path / "press.npz", random_readings(np.arange(50) * 0.01))
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "zarr", None)

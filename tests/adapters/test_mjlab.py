@@ -1,4 +1,4 @@
-"""Touch in mjlab, as it is installed: readings are those of plain MuJoCo at the state in which mjlab leaves its scene."""
+"""Touch in the installed mjlab: readings match plain MuJoCo in the same state."""
 
 import json
 import re
@@ -97,7 +97,7 @@ THERE = {"palm": "robot/palm", "pad": "robot/pad", "cube": "object/cube"}
 
 
 def plain(env, touch) -> tgdsl.SceneState:
-    """Return the state that plain MuJoCo finds where mjlab's environments are."""
+    """Return plain MuJoCo's state at the positions of mjlab's environments."""
     inputs = touch.inputs.renamed(THERE)
     model = tgdsl.instrument(env.scene.spec.copy(), inputs).compile()
     datas = []
@@ -109,7 +109,7 @@ def plain(env, touch) -> tgdsl.SceneState:
     return tgdsl.read_mujoco(touch, model, datas, inputs=inputs)
 
 
-def test_readings_are_those_of_plain_mujoco_where_mjlab_is(tmp_path):
+def test_readings_match_plain_mujoco(tmp_path):
     doc = document(tmp_path)
     env = make(TouchSensorCfg(name="touch", document=doc), TERMS)
     env.reset()
@@ -119,15 +119,15 @@ def test_readings_are_those_of_plain_mujoco_where_mjlab_is(tmp_path):
     skin, expected = env.scene["touch"].data["skin"], touch(plain(env, touch))["skin"]
     assert (skin[0] != skin[1]).any()
     assert (expected[..., :3].abs() > 1e-3).any()
-    for own in (slice(0, 3), slice(3, 6)):  # forces and torques, each of its own full scale
-        scale = float(expected[..., own].abs().max())
-        assert float((skin[..., own] - expected[..., own]).abs().max()) <= 1e-6 * scale
+    for part in (slice(0, 3), slice(3, 6)):  # forces and torques, each relative to its full scale
+        scale = float(expected[..., part].abs().max())
+        assert float((skin[..., part] - expected[..., part]).abs().max()) <= 1e-6 * scale
     assert torch.equal(obs[:, : skin[0].numel()], skin.flatten(1))
     assert torch.equal(obs[:, skin[0].numel() :], touch.observe({"skin": skin})["policy"])
     env.close()
 
 
-def test_loads_are_the_hosts_own_contact_forces(tmp_path):
+def test_loads_are_mjlabs_contact_forces(tmp_path):
     load = {"kind": "link_contact", "links": ["palm"], "feels": ["cube"], "outputs": ["force"]}
     env = make(TouchSensorCfg(name="touch", document=document(tmp_path, load=load)), TERMS)
     env.reset()
@@ -142,12 +142,12 @@ def test_loads_are_the_hosts_own_contact_forces(tmp_path):
         assert set(bodies) == {"robot/palm", "object/cube"}
         net[world] += wrench[:3] if bodies[1] == "robot/palm" else -wrench[:3]
     assert abs(net).max() > 1.0
-    found = env.scene["touch"].data["load"].double().sum(dim=1).numpy()  # the palm has the axes of the world
-    np.testing.assert_allclose(found, net, atol=1e-6 * abs(net).max())
+    load_read = env.scene["touch"].data["load"].double().sum(dim=1).numpy()  # the palm has the axes of the world
+    np.testing.assert_allclose(load_read, net, atol=1e-6 * abs(net).max())
     env.close()
 
 
-def test_a_reading_advances_once_a_control_step_whatever_asks_first(tmp_path):
+def test_a_reading_advances_once_per_control_step(tmp_path):
     doc = document(tmp_path)
     reward = {"touch": RewardTermCfg(func=touch_reward, weight=1.0)}
     env = make(TouchSensorCfg(name="touch", document=doc), TERMS, reward)
@@ -166,22 +166,22 @@ def test_a_reading_advances_once_a_control_step_whatever_asks_first(tmp_path):
     env.close()
 
 
-def test_one_environment_is_reset_alone(tmp_path):
+def test_resetting_one_environment_keeps_the_others(tmp_path):
     stacked = {"kind": "contact_depth", "links": ["palm"], "feels": ["cube"], "history": 3}
     env = make(TouchSensorCfg(name="touch", document=document(tmp_path, depth=stacked)), TERMS)
     env.reset()
     push(env)
     steps(env, 4)
-    before = env.scene["touch"].data["depth"].clone()
-    assert not torch.equal(before[1, 0], before[1, -1])
+    previous = env.scene["touch"].data["depth"].clone()
+    assert not torch.equal(previous[1, 0], previous[1, -1])
     env.reset(env_ids=torch.tensor([1]))
-    after = env.scene["touch"].data["depth"]
-    assert torch.equal(after[0], before[0])
-    assert torch.equal(after[1], after[1, -1:].expand_as(after[1]))  # stacked calls of the new episode alone
+    current = env.scene["touch"].data["depth"]
+    assert torch.equal(current[0], previous[0])
+    assert torch.equal(current[1], current[1, -1:].expand_as(current[1]))  # all stacked calls are of the new episode
     env.close()
 
 
-def test_names_that_mjlabs_scene_lacks_fail_when_the_environment_is_made(tmp_path):
+def test_unknown_names_are_refused_when_the_environment_is_created(tmp_path):
     doc = document(tmp_path)
     for settings, message in (
         ({"names": {"pad": "robot/pda"}}, 'the scene has no body "robot/pda"; did you mean "robot/pad"?'),
@@ -194,7 +194,7 @@ def test_names_that_mjlabs_scene_lacks_fail_when_the_environment_is_made(tmp_pat
         make(TouchSensorCfg(name="touch", document=doc), wrong)
 
 
-def test_the_lines_of_the_page_put_touch_into_an_environment(tmp_path, monkeypatch):
+def test_the_documented_code_adds_touch_to_an_environment(tmp_path, monkeypatch):
     page = (Path(__file__).parents[2] / "docs" / "how-to" / "mjlab.md").read_text(encoding="utf-8")
     lines = re.search(r"^```python\n(from mjlab.*?)^```$", page, flags=re.M | re.S)[1].replace("4096", "2")
     tips = {"kind": "contact_depth", "links": ["pad"], "feels": ["cube"]}
@@ -204,11 +204,11 @@ def test_the_lines_of_the_page_put_touch_into_an_environment(tmp_path, monkeypat
     exec(lines, names)
     env = made(names["scene"], names["observations"])
     env.reset()
-    assert steps(env, 1).shape == (2, 8 * 3 + 4)  # of eight taxels the force, and of the pad's four the depth
+    assert steps(env, 1).shape == (2, 8 * 3 + 4)  # forces of eight taxels, and depths of the pad's four
     env.close()
 
 
-def test_taxels_are_drawn_where_they_are(tmp_path):
+def test_taxels_are_drawn_at_their_positions(tmp_path):
     env = make(TouchSensorCfg(name="touch", document=document(tmp_path)), TERMS)
     env.reset()
     steps(env, 1)

@@ -1,4 +1,4 @@
-"""in_palm_rotate as a task of mjlab: what counts as turning, and that mjlab's own script trains it."""
+"""in_palm_rotate as a task of mjlab: its angle of rotation, and training by mjlab's script."""
 
 import math
 import os
@@ -21,14 +21,14 @@ def env():
 
     cfg = env_cfg()
     cfg.scene.num_envs = 2
-    made = ManagerBasedRlEnv(cfg, device="cpu")
-    made.reset()
-    yield made
-    made.close()
+    environment = ManagerBasedRlEnv(cfg, device="cpu")
+    environment.reset()
+    yield environment
+    environment.close()
 
 
 def put(env, angle: float, move: float = 0.0) -> None:
-    """Turn the cube of the second environment about the vertical from where it was put down, and move it along x."""
+    """Turn the cube of the second environment about the vertical from its start, and move it along x."""
     from tgdsl.adapters.mjlab_tasks import turning
 
     w, *_, z = turning(env).start[1, 3:].tolist()
@@ -60,8 +60,8 @@ def test_turning_is_the_angle_about_the_vertical(env):
     assert turning(env).angle.tolist() == turning(env).reached.tolist() == [0.0, 0.0] and not drop(env).any()
 
 
-def test_mjlabs_own_script_trains_the_task(tmp_path):
-    """Found by its entry point, as pyproject.toml declares it."""
+def test_mjlabs_script_trains_the_task(tmp_path):
+    """It finds the task by the entry point in pyproject.toml."""
     value = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]["mjlab.tasks"]["tgdsl"]
     folder = tmp_path / "packages" / "declared-1.0.dist-info"
     folder.mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""Documents and artefacts as adapters take them; no simulator is needed."""
+"""Documents and artefacts for adapters, without a simulator."""
 
 import mujoco
 import pytest

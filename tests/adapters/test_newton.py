@@ -1,4 +1,4 @@
-"""Touch in Newton, as it is installed: readings are those of plain MuJoCo where Newton's bodies are, forces are Newton's own."""
+"""Touch in the installed Newton: readings match plain MuJoCo in the same pose, forces are Newton's."""
 
 import json
 import re
@@ -20,7 +20,7 @@ from tgdsl.quantities.pairs import Pair
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_readings_are_those_of_plain_mujoco_where_newtons_bodies_are(tmp_path, solver):
+def test_readings_match_plain_mujoco(tmp_path, solver):
     host = Host(solver)
     sensor = SensorTactile(host.model, document(tmp_path))
     host.push()
@@ -28,28 +28,33 @@ def test_readings_are_those_of_plain_mujoco_where_newtons_bodies_are(tmp_path, s
     skin, expected = host.read(sensor)["skin"], sensor.touch(host.plain(sensor.touch))["skin"]
     assert (expected[:, :4, :3].abs() > 1e-3).any()
     assert len(skin) == 1 or (skin[0] != skin[1]).any()
-    for part in (slice(0, 3), slice(3, 6)):  # forces and torques, each of its own full scale
+    for part in (slice(0, 3), slice(3, 6)):  # forces and torques, each relative to its full scale
         scale = float(expected[..., part].abs().max())
         assert float((skin[..., part] - expected[..., part]).abs().max()) <= 1e-6 * scale
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_loads_and_their_places_are_newtons_own(tmp_path, solver):
+def test_loads_and_contact_positions_match_newton(tmp_path, solver):
     host = Host(solver)
     spread = {"kind": "force_taxel", "links": ["palm"], "feels": ["cube"], "slots": 8}
     sensor = SensorTactile(host.model, document(tmp_path, load=LOAD, spread=spread))
     assert sensor.solver_observable_kinds == {"contact_f"}
-    theirs = SensorContact(host.model, sensing_bodies="*palm", counterpart_bodies="*cube", request_contact_attributes=False)
+    newton_sensor = SensorContact(
+        host.model, sensing_bodies="*palm", counterpart_bodies="*cube", request_contact_attributes=False
+    )
     states, read = [], sensor.touch.forward
     sensor.touch.forward = lambda state, **kwargs: states.append(state) or read(state, **kwargs)
     host.push()
     host.step(20)
     readings = host.read(sensor)
-    theirs.update(host.state, host.contacts, observables=host.observables)
+    newton_sensor.update(host.state, host.contacts, observables=host.observables)
     column = [
-        list(row).index(i) for row, i in zip(theirs.counterpart_indices, np.flatnonzero(_is(host.model, "cube")), strict=True)
+        list(row).index(i)
+        for row, i in zip(newton_sensor.counterpart_indices, np.flatnonzero(_is(host.model, "cube")), strict=True)
     ]
-    force, place = (values.numpy()[np.arange(len(column)), column] for values in (theirs.force_matrix, theirs.position_matrix))
+    force, position = (
+        values.numpy()[np.arange(len(column)), column] for values in (newton_sensor.force_matrix, newton_sensor.position_matrix)
+    )
     scale = float(abs(force).max())
     assert scale > 0.5
     state, pair = states[-1], sensor.touch.inputs.pairs.index(Pair("palm", "cube"))
@@ -59,7 +64,7 @@ def test_loads_and_their_places_are_newtons_own(tmp_path, solver):
     np.testing.assert_allclose(in_world, force, atol=1e-6 * scale)
     weight = state.contact_force[:, pair].norm(dim=-1, keepdim=True)
     mean = (weight * state.contact_pos[:, pair]).sum(dim=1) / weight.sum(dim=1)
-    np.testing.assert_allclose(mean, place, atol=1e-6)
+    np.testing.assert_allclose(mean, position, atol=1e-6)
     normal = state.contact_normal[:, pair][weight[..., 0] > 0]
     assert (normal[:, 2] < -0.9).all()  # out of the cube
     assert (state.contact_found[:, pair] == (weight[..., 0] > 0).sum(dim=1)).all()
@@ -69,27 +74,27 @@ def _is(model, name) -> np.ndarray:
     return np.array([label.endswith(f"/{name}") for label in model.body_label])
 
 
-def test_one_world_is_reset_alone(tmp_path):
+def test_resetting_one_world_keeps_the_others(tmp_path):
     delayed = DEPTH | {"noise": {"read_delay": 0.004}}
     host, doc = Host(), document(tmp_path, stacked=DEPTH | {"history": 3}, delayed=delayed, load=LOAD)
     sensor, fresh = (SensorTactile(host.model, doc) for _ in range(2))
     host.push()
     for _ in range(4):
         host.step()
-        before = {name: value.clone() for name, value in host.read(sensor, dt=0.002).items()}
-    assert (before["load"][:, 0, 2] < 0).all()
+        previous = {name: value.clone() for name, value in host.read(sensor, dt=0.002).items()}
+    assert (previous["load"][:, 0, 2] < 0).all()
     host.read(fresh, dt=0.002)
     sensor.reset([1])
     host.state.body_q.assign(host.model.body_q)
-    after = host.read(sensor, dt=0.002, worlds=[1])
+    current = host.read(sensor, dt=0.002, worlds=[1])
     fresh.reset()
     start = host.read(fresh, dt=0.002, worlds=range(WORLDS))
     for name in ("stacked", "delayed", "skin"):
-        assert torch.equal(after[name][0], before[name][0])
-        assert torch.equal(after[name][1], start[name][1])
-        assert not torch.equal(after[name][1], before[name][1])
-    assert torch.equal(after["load"][0], before["load"][0])
-    assert not after["load"][1].any()  # the last contacts are another episode's
+        assert torch.equal(current[name][0], previous[name][0])
+        assert torch.equal(current[name][1], start[name][1])
+        assert not torch.equal(current[name][1], previous[name][1])
+    assert torch.equal(current["load"][0], previous["load"][0])
+    assert not current["load"][1].any()  # the last contacts belong to the previous episode
     host.step()
     assert host.read(sensor, dt=0.002)["load"][1].any()
 
@@ -110,7 +115,7 @@ def test_joints_are_read_by_name(tmp_path):
     assert states[-1].joint_vel[:, 0].tolist() == host.state.joint_qd.numpy()[at[1]].tolist()
 
 
-def test_names_that_the_model_lacks_fail_when_the_sensor_is_made(tmp_path):
+def test_unknown_names_and_missing_inputs_are_refused(tmp_path):
     host, doc = Host(), document(tmp_path)
     for settings, message in (
         ({"names": {"pad": "hand/pda"}}, 'the scene has no body "hand/pda"; known bodies: hand/worldbody/'),
@@ -135,7 +140,7 @@ def test_worlds_that_differ_are_refused(tmp_path):
         SensorTactile(builder.finalize(device="cpu"), document(tmp_path))
 
 
-def test_a_model_without_worlds_is_one(tmp_path):
+def test_a_model_without_worlds_counts_as_one(tmp_path):
     builder = newton.ModelBuilder()
     builder.add_mjcf(SCENE)
     model = builder.finalize(device="cpu")
@@ -150,7 +155,7 @@ def test_a_model_without_worlds_is_one(tmp_path):
     assert skin.any() and torch.equal(skin, host.read(SensorTactile(host.model, document(tmp_path)))["skin"][:1])
 
 
-def test_the_lines_of_the_page_read_touch(tmp_path, monkeypatch):
+def test_the_documented_code_reads_touch(tmp_path, monkeypatch):
     page = (Path(__file__).parents[2] / "docs" / "how-to" / "newton.md").read_text(encoding="utf-8")
     lines = re.search(r"^```python\n(import newton.*?)^```$", page, flags=re.M | re.S)[1]
     monkeypatch.chdir(tmp_path)

@@ -16,7 +16,7 @@ compare:
 """
 
 
-def test_the_true_law_is_at_the_floor_and_others_are_not(tmp_path):
+def test_only_the_true_law_reaches_the_noise_floor(tmp_path):
     path = document(tmp_path)
     (tmp_path / "models.yaml").write_text(MODELS)
     result = tgdsl.compare(path, recording(path), tmp_path / "models.yaml", starts=1, intervals="none")
@@ -29,7 +29,7 @@ def test_the_true_law_is_at_the_floor_and_others_are_not(tmp_path):
     assert f"{true.error:.3f}" in lines[2] and "touch.depth_exponent 1." in lines[2]
 
 
-def test_mistakes_have_a_place(tmp_path):
+def test_mistakes_are_located(tmp_path):
     (tmp_path / "models.yaml").write_text(MODELS.replace("set:", "sett:"))
     with pytest.raises(SpecError, match=r"models\.yaml:4:\d+: compare\.linear spring"):
         tgdsl.compare(document(tmp_path), {}, tmp_path / "models.yaml")

@@ -1,10 +1,10 @@
-"""Intervals of 95 % on recordings made with known parameters, noise and two clocks, for each kind that has parameters.
+"""Coverage of 95 % intervals on recordings with known parameters, noise and two clocks, for each kind.
 
-`PYTHONPATH=tests/helpers python tests/calibration/test_coverage.py 200 [CASE …]` prints the share that holds in 200 sets of each.
+`PYTHONPATH=tests/helpers python tests/calibration/test_coverage.py 200 [CASE …]` prints the coverage over 200 sets of each.
 
-Kinds without a case: `contact` and `link_contact` read bits, which no derivative reaches; `contact_depth` and
-`surface_distance` have no parameter that changes their number; the scraping of `contact_audio` is a random sound. A fit of
-`microphone` takes minutes, step by step. `proximity` is not tried. A block that cools, of `temperature_grid`, has a closed form.
+Kinds without a case: `contact` and `link_contact` read bits, which have no derivative; `contact_depth` and
+`surface_distance` have no parameter that changes their values; the scraping of `contact_audio` is random. A fit of
+`microphone` takes minutes, step by step. `proximity` is not tested. A cooling block of `temperature_grid` has a closed form.
 """
 
 import json
@@ -23,7 +23,7 @@ from tgdsl.calibration.recordings import NAMES_OF, velocities
 from tgdsl.module.state import SHAPES
 
 LAG, NOISE, NUM = 0.12, 0.01, 25
-"""How far the sensor's clock is behind the states' [s]; noise over the RMS of the reading; samples."""
+"""Lag of the sensor's clock behind the states' [s]; noise over the RMS of the reading; samples."""
 SCENE = """
 <mujoco><worldbody>
   <body name="pad"><geom type="box" size=".02 .02 .01" pos="0 0 -.01"/></body>
@@ -34,7 +34,7 @@ SCENE = """
 
 
 class Case(NamedTuple):
-    """Sensor as guessed; true parameters; how far the ball is lower [m]; what nothing tells apart; sets of the slow test."""
+    """Guessed sensor; true parameters; how much lower the ball is [m]; unidentifiable parameters; sets of the slow test."""
 
     sensors: dict[str, dict[str, Any]]
     true: dict[str, float]
@@ -112,7 +112,7 @@ def document(folder: Path, case: Case) -> Path:
 
 
 def scene_states(lower: float, num: int = 1200) -> dict[str, np.ndarray]:
-    """Return a ball that presses at different depths and speeds and moves a bit sideways, and an arm that is driven."""
+    """Return states of a ball that presses at varying depths and speeds and slides a bit, and of a driven arm."""
     time = np.linspace(0.0, 3.0, num)
     pos, quat = np.zeros((num, 3, 3)), np.zeros((num, 3, 4))
     pos[:, 0, 0] = 1e-3 * np.sin(2 * time)
@@ -133,25 +133,26 @@ def scene_states(lower: float, num: int = 1200) -> dict[str, np.ndarray]:
 
 
 def recording(path: Path, case: Case, seed: int) -> dict[str, Any]:
-    """Return states on one clock, and on another what a sensor with the true parameters read, with noise."""
+    """Return states on one clock, and noisy readings with the true parameters on another."""
     states, clock = scene_states(case.lower), np.linspace(0.4, 2.6, NUM)
     touch = tgdsl.compile(path, dtype="float64", overrides={f"sensors.{name}": value for name, value in case.true.items()})
     fields = states | velocities(states["time"], states)
-    names, now = {"body": ["ball", "pad", "arm"]}, {}
+    names, interpolated = {"body": ["ball", "pad", "arm"]}, {}
     for name in (name for name in touch.inputs.fields if name != "dt"):
         value, axis = fields[name], str(SHAPES[name][0])
-        value = value[:, [names[axis].index(each) for each in touch.inputs.names[axis]]] if axis in names else value
+        value = value[:, [names[axis].index(parts) for parts in touch.inputs.names[axis]]] if axis in names else value
         columns = value.reshape(len(value), -1).T
         columns = np.stack([np.interp(clock, states["time"], column) for column in columns], axis=1)
-        now[name] = torch.from_numpy(columns.reshape(NUM, *value.shape[1:]))
+        interpolated[name] = torch.from_numpy(columns.reshape(NUM, *value.shape[1:]))
     if touch.has_state:
         dt = float(clock[1] - clock[0])
-        each = [
-            touch(tgdsl.SceneState(**{n: v[i : i + 1] for n, v in now.items()}, dt=dt))["touch"].clone() for i in range(NUM)
+        parts = [
+            touch(tgdsl.SceneState(**{n: v[i : i + 1] for n, v in interpolated.items()}, dt=dt))["touch"].clone()
+            for i in range(NUM)
         ]
-        target = torch.cat(each).numpy()
+        target = torch.cat(parts).numpy()
     else:
-        target = touch(tgdsl.SceneState(**now))["touch"].numpy()
+        target = touch(tgdsl.SceneState(**interpolated))["touch"].numpy()
     noise = NOISE * np.sqrt((target**2).mean())
     target = target + np.random.default_rng(seed).normal(0.0, noise, target.shape)
     output = next(output for output in touch.outputs if output.name == "touch")
@@ -161,7 +162,7 @@ def recording(path: Path, case: Case, seed: int) -> dict[str, Any]:
 
 
 def hits(folder: Path, case: Case, num: int) -> list[bool]:
-    """Return which intervals hold the true value, of so many sets."""
+    """Return which intervals of `num` sets contain the true value."""
     path, result = document(folder, case), []
     for seed in range(num):
         fit = tgdsl.calibrate(path, recording(path, case, seed), list(case.true), starts=1)
@@ -170,7 +171,7 @@ def hits(folder: Path, case: Case, num: int) -> list[bool]:
 
 
 def assert_covered(held: list[bool]) -> None:
-    """Assert that no more intervals miss than in 998 of 1000 runs of intervals that hold 95 %."""
+    """Assert that no more intervals miss than in 998 of 1000 runs with true 95 % coverage."""
     assert held.count(False) <= stats.binom.ppf(0.998, len(held), 0.05), held
 
 
@@ -185,8 +186,8 @@ def test_intervals_of_each_kind_cover_the_truth(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.untold])
-def test_what_no_reading_tells_apart_is_named(tmp_path, name):
-    """Displacement depends on the ratio of the two moduli alone."""
+def test_unidentifiable_parameters_are_named(tmp_path, name):
+    """Displacement depends only on the ratio of the two moduli."""
     case = CASES[name]
     path = document(tmp_path, case)
     fit = tgdsl.calibrate(path, recording(path, case, 0), list(case.untold), starts=1, intervals="none")
@@ -194,7 +195,7 @@ def test_what_no_reading_tells_apart_is_named(tmp_path, name):
 
 
 def cooling(path: Path) -> Path:
-    """Write an aluminium cube of 24 mm at 60 °C in air of 22 °C, one cell without radiation."""
+    """Write the document of a 24 mm aluminium cube at 60 °C in air of 22 °C: one cell without radiation."""
     path.with_name("scene.xml").write_text(SCENE.replace(".02 .02 .01", ".012 .012 .012"))
     sensor = {"kind": "temperature_grid", "links": "pad", "feels": ["ball"], "cells": [1, 1, 1], "material": "aluminium"}
     sensor |= {"temperature": "60 degC", "emissivity": 0, "convection": 15, "outputs": "mean"}
@@ -205,7 +206,7 @@ def cooling(path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_convection_and_its_interval_are_those_of_the_closed_form(tmp_path):
+def test_convection_and_its_interval_match_the_closed_form(tmp_path):
     """T = T_a + (T_0 − T_a) exp(−U A t / C), U = 1 / (1/h + Δ/2k): least squares with Student's interval of one parameter."""
     path, true, num = cooling(tmp_path / "touch.yaml"), 20.0, 13
     edge, (conductivity, density, heat) = 0.024, (237.0, 2702.0, 903.0)  # Incropera
@@ -222,11 +223,11 @@ def test_convection_and_its_interval_are_those_of_the_closed_form(tmp_path):
     still["body_quat"][..., 0] = 1.0
     of_target = {"target:touch": read[:, None, None], "clock:touch": time, "unit:touch": "degC"}
     fit = tgdsl.calibrate(path, {"time": time, **still, **of_target}, ["touch.convection=5:80"], starts=1)
-    found = optimize.least_squares(lambda film: temperature(film[0]) - read, [15.0])
-    error = np.sqrt((found.fun**2).sum() / (num - 1) / (found.jac**2).sum())
+    closed_fit = optimize.least_squares(lambda film: temperature(film[0]) - read, [15.0])
+    error = np.sqrt((closed_fit.fun**2).sum() / (num - 1) / (closed_fit.jac**2).sum())
     convection, half = fit.parameters["touch.convection"], stats.t.ppf(0.975, num - 1) * error
-    assert convection.value == pytest.approx(found.x[0], rel=2e-3)
-    assert (convection.low, convection.high) == pytest.approx((found.x[0] - half, found.x[0] + half), rel=5e-3)
+    assert convection.value == pytest.approx(closed_fit.x[0], rel=2e-3)
+    assert (convection.low, convection.high) == pytest.approx((closed_fit.x[0] - half, closed_fit.x[0] + half), rel=5e-3)
 
 
 if __name__ == "__main__":

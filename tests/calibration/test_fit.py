@@ -34,19 +34,19 @@ def test_parameters_and_clock_are_found(fitted):
 
 
 def test_a_load_cell_under_all_taxels_is_enough(path):
-    """The sum of all rows, with noise of its own, finds the same parameters."""
+    """The sum of all rows gives the same parameters."""
     arrays = recording(path)
     arrays["target:touch"] = arrays["target:touch"].sum(axis=1, keepdims=True)
     fit = tgdsl.calibrate(path, arrays | {"rows:touch": np.array("sum")}, FIT, hold_out="time", starts=1)
     stiffness, exponent = (fit.parameters[name] for name in FIT)
     assert stiffness.low < 900 < stiffness.high and exponent.low < 1.3 < exponent.high
-    assert fit.errors[0].error == pytest.approx(3**0.5 * fit.errors[0].floor, rel=0.2)  # of three rows' noise
+    assert fit.errors[0].error == pytest.approx(3**0.5 * fit.errors[0].floor, rel=0.2)  # noise of three rows
     with pytest.raises(TgdslError, match=r"hold_out: taxel: each target has one row; expected time or recording"):
         tgdsl.calibrate(path, arrays | {"rows:touch": np.array("sum")}, FIT, hold_out="taxel")
 
 
 def test_a_linear_parameter_is_solved_for(fitted):
-    """Force is linear in the stiffness, and not in the exponent; the solution is the minimum of the search without that."""
+    """Force is linear in stiffness, not in the exponent; a plain search finds the same minimum."""
     problem, solution = fitted.problem, fitted.solution
     assert problem.linear == (0,)
     plain = problem.minimise(solution.x, are_fixed=True)
@@ -55,11 +55,10 @@ def test_a_linear_parameter_is_solved_for(fitted):
     assert plain.x == pytest.approx(solution.x, abs=5e-3)
 
 
-def test_jacobian_of_the_projected_residual(fitted):
-    """Against central differences."""
+def test_the_jacobian_of_the_projected_residual_matches_differences(fitted):
     problem, x = fitted.problem, fitted.solution.x
-    found = problem.jacobian(x, problem.weights(), (1, 2))
-    for j, column in zip((1, 2), found.T, strict=True):
+    jacobian = problem.jacobian(x, problem.weights(), (1, 2))
+    for j, column in zip((1, 2), jacobian.T, strict=True):
         step = 1e-3 * np.eye(3)[j]
         slope = (
             problem.solve(x + step, problem.weights()).residual - problem.solve(x - step, problem.weights()).residual
@@ -67,52 +66,52 @@ def test_jacobian_of_the_projected_residual(fitted):
         assert column == pytest.approx(slope, abs=2e-2 * abs(slope).max())
 
 
-def test_the_document_is_written_and_predicts(path, fitted):
+def test_the_fitted_document_predicts_new_recordings(path, fitted):
     out = fitted.document(path.parent / "fitted.yaml")
     text = out.read_text()
     assert f"normal_stiffness: {fitted.parameters[FIT[0]].value:.6g}  # fitted, 95 %: " in text
-    again = tgdsl.calibrate(out, recording(path, seed=1))
-    assert again.errors[0].error == pytest.approx(again.errors[0].floor, rel=0.1)
-    assert not again.parameters
+    refit = tgdsl.calibrate(out, recording(path, seed=1))
+    assert refit.errors[0].error == pytest.approx(refit.errors[0].floor, rel=0.1)
+    assert not refit.parameters
     with pytest.raises(TgdslError, match="relative to its folder"):
         fitted.document(path.parent / "elsewhere" / "fitted.yaml")
 
 
-def test_it_prints_and_draws(fitted, tmp_path):
+def test_a_fit_can_be_printed_and_plotted(fitted, tmp_path):
     text = str(fitted)
     assert "touch.depth_exponent" in text and "held out" in text and "warning: touch.normal_stiffness" in text
     assert fitted.plot(tmp_path / "fit.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_lowered_again_is_compiled_again(path):
-    """A parameter set and set back gives the readings of a document that is compiled with it, to the bit."""
+def test_changed_parameters_read_like_a_compiled_document(path):
+    """Setting and restoring a parameter gives the compiled document's readings to the bit."""
     model = Model(path, FIT)
-    before = model.module
+    first_module = model.module
     model.set((900.0, 1.3))
-    assert model.module is before
+    assert model.module is first_module
     states = motion(40)
     fields = {name: states[name] for name in ("body_pos", "body_quat")}
     fields |= velocities(states["time"], fields)
-    found = model._read("touch", fields, states["time"])
-    assert np.array_equal(found, readings(path, states))
+    result = model._read("touch", fields, states["time"])
+    assert np.array_equal(result, readings(path, states))
     model.set([parameter.start for parameter in model.parameters])
     assert np.array_equal(model._read("touch", fields, states["time"]), readings(path, states, {}))
 
 
-def test_what_changes_requests_is_compiled_again(path):
-    """An elastomer's `standoff` is part of what is requested of the scene."""
+def test_parameters_that_change_requests_are_recompiled(path):
+    """An elastomer's `standoff` changes its requests of the scene."""
     skin = {
         "sensors": {"touch": {"kind": "elastomer", "links": "pad", "feels": ["ball"], "standoff": 0.001, "shear_strength": 0}}
     }
     model = Model(path, ["touch.standoff"], {"sensors.touch": skin["sensors"]["touch"]})
-    before = model.module
+    first_module = model.module
     model.set((0.002,))
-    assert model.module is not before
+    assert model.module is not first_module
     states = motion(20)
-    found = model._read("touch", states, states["time"])
+    result = model._read("touch", states, states["time"])
     touch = tgdsl.compile(path, overrides={"sensors.touch": {**skin["sensors"]["touch"], "standoff": 0.002}}, dtype="float64")
     state = tgdsl.SceneState(**{name: torch.from_numpy(states[name]) for name in ("body_pos", "body_quat")})
-    assert np.array_equal(found, touch(state)["touch"].numpy())
+    assert np.array_equal(result, touch(state)["touch"].numpy())
 
 
 def test_values_that_exclude_each_other_are_infeasible(path):
@@ -140,18 +139,18 @@ def test_values_that_exclude_each_other_are_infeasible(path):
         ("touch.normal_stiffness=600:900", "the document's value 500 is out of the range"),
     ],
 )
-def test_parameters_that_cannot_be_fitted(path, fit, message):
+def test_parameters_that_cannot_be_fitted_are_refused(path, fit, message):
     with pytest.raises(TgdslError, match=message):
         Model(path, [fit])
 
 
-def test_no_recording_is_said_to_be_none(path):
+def test_a_fit_needs_a_recording(path):
     with pytest.raises(TgdslError, match="there is no recording, expected at least one"):
         tgdsl.calibrate(path, [], ["touch.normal_stiffness"])
 
 
-def test_what_the_data_cannot_tell_is_named(path):
-    """No damping shows in a ball that rests: its interval is the whole range. A range that ends before the truth is hit."""
+def test_unidentified_parameters_are_named(path):
+    """A resting ball shows no damping; a range that excludes the truth gives its end."""
     arrays = recording(path, lag=0.0)
     still = arrays | {name: np.repeat(arrays[name][600:601], 1200, axis=0) for name in ("body_pos", "body_quat")}
     still["target:touch"] = np.repeat(arrays["target:touch"][30:31], 60, axis=0)
@@ -163,8 +162,8 @@ def test_what_the_data_cannot_tell_is_named(path):
     assert any(text.startswith("touch.depth_exponent: at the end of its range, 1.1") for text in short.warnings)
 
 
-def test_a_pose_offset_within_its_prior(path):
-    """The ball was 0.3 mm lower than was recorded."""
+def test_a_pose_offset_is_found_within_its_prior(path):
+    """The ball was 0.3 mm lower than recorded."""
     arrays = recording(path, lag=0.0)
     arrays["body_pos"] = arrays["body_pos"] + np.array([[0, 0, 3e-4], [0, 0, 0]])
     arrays["width:body_pos"] = np.array([[0, 0, 5e-4], [0, 0, 0]])
@@ -173,7 +172,7 @@ def test_a_pose_offset_within_its_prior(path):
     assert fit.parameters["touch.depth_exponent"].low < 1.3 < fit.parameters["touch.depth_exponent"].high
 
 
-def test_gain_and_offset_are_the_recordings_own(path):
+def test_each_recording_has_its_own_gain_and_offset(path):
     first, second = recording(path, seed=1), recording(path, seed=2)
     second["target:touch"] = 0.8 * second["target:touch"] + np.array([0.0, 0.1, -0.2])
     fit = tgdsl.calibrate(path, [first, second], FIT[1:], reading="offset", gain=True, starts=1, intervals="none")
@@ -191,15 +190,15 @@ def test_robust_fits_ignore_lost_rows(path):
 
 
 @pytest.mark.parametrize("by", ["taxel", "blocks", "recording"])
-def test_other_ways_to_hold_out(path, by):
+def test_each_way_to_hold_out_works(path, by):
     fit = tgdsl.calibrate(
         path, [recording(path, seed=1), recording(path, seed=2)], FIT, hold_out=by, folds=3, starts=1, intervals="none"
     )
     assert all(0.9 * e.error < e.held_out < 1.15 * e.error for e in fit.errors)
 
 
-def test_a_wrong_model_is_worse_on_what_was_held_out(path):
-    """The truth has damping, which the fit cannot have: no warning of noise fitted, and the error is above the floor."""
+def test_a_wrong_model_stays_above_the_noise_floor(path):
+    """The truth has damping, the fit does not: its error is above the floor until damping is fitted."""
     arrays = recording(path)
     true = TRUE | {"sensors.touch.normal_damping": 3e4}
     states = motion(1200)

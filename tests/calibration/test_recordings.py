@@ -1,4 +1,4 @@
-"""Recordings: what is wrong with one is said by its key; units, names and clocks mean what they say."""
+"""Recordings: mistakes are named by key; units, names and clocks are applied."""
 
 import numpy as np
 import pytest
@@ -74,7 +74,7 @@ BAD = {
 
 
 @pytest.mark.parametrize(("change", "message"), BAD.values(), ids=BAD)
-def test_what_is_wrong_is_said_by_its_key(pressed, change, message):
+def test_mistakes_are_named_by_key(pressed, change, message):
     _, touch, arrays = pressed
     arrays = dict(arrays)
     change(arrays)
@@ -82,7 +82,7 @@ def test_what_is_wrong_is_said_by_its_key(pressed, change, message):
         read(touch, arrays)
 
 
-def test_all_that_is_wrong_is_said_at_once(pressed, tmp_path):
+def test_all_mistakes_are_reported_at_once(pressed, tmp_path):
     _, touch, arrays = pressed
     left = {key: value for key, value in arrays.items() if key not in ("clock:touch", "unit:touch")}
     np.savez(tmp_path / "bad.npz", **left)
@@ -92,14 +92,14 @@ def test_all_that_is_wrong_is_said_at_once(pressed, tmp_path):
     assert str(raised.value).startswith(f"{tmp_path / 'bad.npz'}: clock:touch: ")
 
 
-def test_a_wrong_name_of_a_reading_is_one_mistake(pressed):
+def test_an_unknown_reading_gives_one_message(pressed):
     _, touch, arrays = pressed
     with pytest.raises(SpecError) as error:
         read(touch, {key.replace(":touch", ":toch"): value for key, value in arrays.items()})
     assert str(error.value) == '<arrays>: target:toch: unknown key; did you mean "target:touch"?'
 
 
-def test_what_is_no_recording_is_refused(pressed, tmp_path):
+def test_other_files_are_refused(pressed, tmp_path):
     _, touch, _ = pressed
     (tmp_path / "text.npz").write_text("no archive")
     (tmp_path / "empty.npz").touch()
@@ -122,32 +122,32 @@ def test_fewer_numbers_than_unknowns_are_refused(pressed):
         tgdsl.calibrate(path, few, ["touch.normal_stiffness"])
 
 
-def test_units_weights_and_order_of_names(pressed):
+def test_units_weights_and_order_of_names_are_applied(pressed):
     _, touch, arrays = pressed
     other = arrays | {"unit:touch": np.array("mN"), "target:touch": 1e3 * arrays["target:touch"], "floor:touch": np.array(2.0)}
     other |= {"bodies": np.array(["pad", "ball"]), "body_pos": arrays["body_pos"][:, ::-1]}
     other["target:touch"] = with_value(other["target:touch"], (0, 0, 0), np.nan)
     other["weight:touch"] = with_value(np.ones((60, 3, 3)), (0, 0, 0), 0.0)
-    found, plain = read(touch, other), read(touch, arrays)
-    assert found.targets[0].value[1:] == pytest.approx(plain.targets[0].value[1:], rel=1e-12)
-    assert found.targets[0].value[0, 0, 0] == 0 and found.targets[0].floor == pytest.approx(2e-3)
-    assert np.array_equal(found.fields["body_pos"], plain.fields["body_pos"])
+    converted, plain = read(touch, other), read(touch, arrays)
+    assert converted.targets[0].value[1:] == pytest.approx(plain.targets[0].value[1:], rel=1e-12)
+    assert converted.targets[0].value[0, 0, 0] == 0 and converted.targets[0].floor == pytest.approx(2e-3)
+    assert np.array_equal(converted.fields["body_pos"], plain.fields["body_pos"])
 
 
-def test_states_between_steps_and_velocities_of_a_turning_body(pressed):
-    """A body that turns at a constant rate: nlerp between close steps, and ω from the quaternions, q or −q alike."""
+def test_states_are_interpolated_and_velocities_derived(pressed):
+    """A body turns at a constant rate: nlerp between steps, and ω from quaternions of either sign."""
     time, rate = np.linspace(0, 1, 401), np.array([0.4, -1.1, 0.7])
     quat = Rotation.from_rotvec(time[:, None] * rate).as_quat()[:, [3, 0, 1, 2]]
     quat[::2] *= -1
     pos = np.stack([np.sin(time), time**2, time], axis=1)
-    found = velocities(time, {"body_pos": pos[:, None], "body_quat": quat[:, None]})
-    assert found["body_angvel"][5:-5, 0] == pytest.approx(np.tile(rate, (391, 1)), abs=1e-5)
-    assert found["body_linvel"][5:-5, 0, 0] == pytest.approx(np.cos(time[5:-5]), abs=1e-5)
+    derived = velocities(time, {"body_pos": pos[:, None], "body_quat": quat[:, None]})
+    assert derived["body_angvel"][5:-5, 0] == pytest.approx(np.tile(rate, (391, 1)), abs=1e-5)
+    assert derived["body_linvel"][5:-5, 0, 0] == pytest.approx(np.cos(time[5:-5]), abs=1e-5)
 
     _, touch, arrays = pressed
     states = motion(401)
     states["body_quat"][:, 0] = quat
-    turning = read(touch, arrays | states)
-    at = turning.state_at(np.array([1.00001, 2.3]), turning.fields)["body_quat"][:, 0]
+    states_read = read(touch, arrays | states)
+    at = states_read.state_at(np.array([1.00001, 2.3]), states_read.fields)["body_quat"][:, 0]
     exact = Rotation.from_rotvec(np.array([[1.00001], [2.3]]) / 3.0 * rate).as_quat()[:, [3, 0, 1, 2]]
     assert abs((at * exact).sum(axis=1)) == pytest.approx(1.0, abs=1e-9)

@@ -1,4 +1,4 @@
-"""Recordings in CSV files: columns, units, invalid numbers, and mistakes by line and column."""
+"""Recordings in CSV files: columns, units, invalid numbers, and located mistakes."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ targets:
 
 @pytest.fixture
 def folder(tmp_path):
-    """The recording of `recorded_presses` in two files: positions in mm, forces in -mN, and two numbers that are none."""
+    """Write the recording to two files: positions in mm, forces in -mN, and two invalid numbers."""
     arrays = recording(document(tmp_path))
     ball, pad = (1e3 * arrays["body_pos"][:, i] for i in (0, 1))
     rows = [",".join(f"{value:.9g}" for value in line) for line in np.column_stack([arrays["time"], ball, pad])]
@@ -45,13 +45,13 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_a_recording_in_tables_is_the_recording(folder):
+def test_a_recording_in_tables_reads_the_same(folder):
     path = folder / "touch.yaml"
     touch = tgdsl.compile(path, dtype="float64")
     outputs = {output.name: output for output in touch.outputs}
-    found, arrays = load_recording(folder / "press.yaml", touch.inputs, outputs), recording(path)
-    assert found.fields["body_pos"] == pytest.approx(arrays["body_pos"], abs=1e-10)
-    (target,) = found.targets
+    recorded, arrays = load_recording(folder / "press.yaml", touch.inputs, outputs), recording(path)
+    assert recorded.fields["body_pos"] == pytest.approx(arrays["body_pos"], abs=1e-10)
+    (target,) = recorded.targets
     weight = np.ones((60, 3))
     weight[3, 1] = weight[5, 0] = 0
     assert np.array_equal(target.weight[:, :, 0], weight)
@@ -106,7 +106,7 @@ def test_a_recording_in_tables_is_the_recording(folder):
         ),
     ],
 )
-def test_mistakes_are_said_by_line_and_column(folder, file, old, new, message):
+def test_mistakes_are_located_by_line_and_column(folder, file, old, new, message):
     text = (folder / file).read_text()
     assert old in text
     (folder / file).write_text(text.replace(old, new, 1))
@@ -123,7 +123,7 @@ def test_mistakes_are_said_by_line_and_column(folder, file, old, new, message):
         ("0 0 0 34\n", 'found one column, "0 0 0 34"; expected commas between columns'),
     ],
 )
-def test_a_file_that_is_no_table_is_one_mistake(folder, text, message):
+def test_a_file_without_a_table_gives_one_message(folder, text, message):
     (folder / "states.csv").write_text(text)
     with pytest.raises(SpecError) as error:
         read_tables(folder / "press.yaml")

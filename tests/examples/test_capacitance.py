@@ -1,4 +1,4 @@
-"""The worked example of docs/how-to/kind.md against closed forms of the parallel-plate capacitor."""
+"""The example of docs/how-to/kind.md against closed forms of the parallel-plate capacitor."""
 
 import sys
 from pathlib import Path
@@ -11,7 +11,7 @@ import tgdsl
 from tgdsl.errors import SpecError
 from tgdsl.testing import KindConformance
 
-sys.path.append(str(Path(__file__).parents[2] / "examples" / "plugins"))  # as its own package has it
+sys.path.append(str(Path(__file__).parents[2] / "examples" / "plugins"))  # as in its package
 
 from capacitance import CAPACITANCE
 
@@ -50,7 +50,7 @@ def build(tmp_path):
 
 
 def read(touch, *gaps, other=1.0):
-    """Return the readings with the plate's lower side at some distances from the taxels, (gap, taxel)."""
+    """Return the readings with the plate's lower side at these distances from the taxels, (gap, taxel)."""
     state = touch.example_state(len(gaps))
     plate, second = (touch.inputs.bodies.index(name) for name in ("plate", "other"))
     state.body_quat[:] = torch.tensor([1.0, 0, 0, 0])
@@ -63,37 +63,37 @@ def read(touch, *gaps, other=1.0):
 AREA = 0.06 * 0.06 / 12
 
 
-def in_series(air, cover, permittivity=PERMITTIVITY):
-    """Two plates with two dielectrics in between: 1/C = d/(ε₀ A) + t/(ε₀ ε_r A)."""
+def capacitance_in_series(air, cover, permittivity=PERMITTIVITY):
+    """Return the capacitance of two plates with two dielectrics: 1/C = d/(ε₀ A) + t/(ε₀ ε_r A)."""
     return 1 / (air / (EPSILON * AREA) + cover / (EPSILON * permittivity * AREA))
 
 
-REST = in_series(RANGE, THICKNESS)
+REST = capacitance_in_series(RANGE, THICKNESS)
 
 
 def test_two_plates_are_two_capacitors_in_series(build):
     touch = build(thickness=THICKNESS, least_thickness=LEAST, permittivity=PERMITTIVITY, range=RANGE)
-    expected = [in_series(air, THICKNESS) - REST for air in (1e-4, 1e-3, 5e-3)]
+    expected = [capacitance_in_series(air, THICKNESS) - REST for air in (1e-4, 1e-3, 5e-3)]
     np.testing.assert_allclose(read(touch, 1e-4, 1e-3, 5e-3), np.repeat(expected, 12).reshape(3, 12), rtol=1e-9)
 
 
 def test_a_pressed_cover_is_thinner_down_to_its_least_thickness(build):
     touch = build(thickness=THICKNESS, least_thickness=LEAST, permittivity=PERMITTIVITY, range=RANGE)
-    expected = [in_series(0.0, cover) - REST for cover in (THICKNESS, 1.5e-3, LEAST, LEAST)]
+    expected = [capacitance_in_series(0.0, cover) - REST for cover in (THICKNESS, 1.5e-3, LEAST, LEAST)]
     np.testing.assert_allclose(read(touch, 0.0, -5e-4, -1.5e-3, -3e-3)[:, 5], expected, rtol=1e-9)
 
 
-def test_beyond_the_range_it_reads_nothing(build):
+def test_readings_beyond_the_range_are_zero(build):
     far = read(build(thickness=THICKNESS, permittivity=PERMITTIVITY, range=RANGE), RANGE + 1e-6, 0.02, 0.3)
     np.testing.assert_array_equal(far, np.zeros_like(far))
 
 
-def test_of_two_objects_the_nearest_counts(build):
+def test_the_nearest_of_two_objects_counts(build):
     touch = build(range=RANGE)
     np.testing.assert_array_equal(read(touch, 5e-3, other=1e-3), read(touch, 1e-3))
 
 
-def test_the_sensitivity_is_that_of_the_closed_form(build):
+def test_the_sensitivity_matches_the_closed_form(build):
     """−dC/dg = C²/(ε₀ A), by a central difference of the readings."""
     touch = build(thickness=THICKNESS, permittivity=PERMITTIVITY, range=RANGE)
     step = 1e-7
@@ -106,7 +106,7 @@ def test_a_least_thickness_above_the_thickness_is_refused(build):
         build(thickness=0.002, least_thickness=0.003)
 
 
-def test_a_rest_value_that_is_rounded_is_named():
+def test_a_wrong_rest_value_is_named():
     rest = torch.tensor([1.25])
     TestCapacitance()._assert_rests(rest.expand(3, 2, 1), rest, "rows")
     with pytest.raises(AssertionError, match=r"^inactive taxels read \[1.5\], expected `rest`, which is \[1.25\] in float32"):

@@ -1,4 +1,4 @@
-"""examples/materials_audio.yaml: three boxes that are one to the solver, told apart by ear in drops from anywhere."""
+"""examples/materials_audio.yaml: three boxes that are equal to the solver sound different in random drops."""
 
 import itertools
 from pathlib import Path
@@ -15,12 +15,12 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "materials_audio.yaml"
 BOXES = ("steel", "wood", "glass")
 NUM_DROPS, NUM_STEPS, RATE = 16, 400, 24000.0
 SPAN = int(0.06 * RATE)
-"""Samples after an impact that are looked at: no ball is back so soon."""
+"""Samples after an impact, before any ball bounces back."""
 
 
 @pytest.fixture(scope="module")
 def drops():
-    """What each box sounds like from the first impact on, (drop, sample), where the balls were at the end, and the modes."""
+    """Return the sounds from the first impact, (drop, sample), final poses of balls, impact times and modes."""
     touch = tgdsl.compile(EXAMPLE, sensors=BOXES, dtype="float64")
     sim = tgdsl.simulate(touch, NUM_DROPS)
     rng = np.random.default_rng(5)
@@ -36,13 +36,13 @@ def drops():
         readings = touch(sim.state())
         for name in BOXES:
             blocks[name].append(readings[name][:, :, 0, 0])
-    found = {name: torch.cat(blocks[name], dim=1).numpy() for name in BOXES}
-    loud = {name: np.abs(own) > 0.01 * np.abs(own).max(axis=1, keepdims=True) for name, own in found.items()}
-    first = {name: own.argmax(axis=1) for name, own in loud.items()}
-    assert all((np.abs(own).max(axis=1) > 1e-3).all() for own in found.values()) and sim.num_envs == NUM_DROPS
-    cut = {n: np.stack([own[k : k + SPAN] for own, k in zip(found[n], first[n], strict=True)]) for n in BOXES}
+    sounds = {name: torch.cat(blocks[name], dim=1).numpy() for name in BOXES}
+    loud = {name: np.abs(value) > 0.01 * np.abs(value).max(axis=1, keepdims=True) for name, value in sounds.items()}
+    first = {name: value.argmax(axis=1) for name, value in loud.items()}
+    assert all((np.abs(value).max(axis=1) > 1e-3).all() for value in sounds.values()) and sim.num_envs == NUM_DROPS
+    cut = {n: np.stack([value[k : k + SPAN] for value, k in zip(sounds[n], first[n], strict=True)]) for n in BOXES}
     balls = [sim.qpos[:, sim.joints[f"ball_{i + 1}"].qpos].numpy() for i in range(3)]
-    modes = {own.name: (own.constants["frequency"][0], own.constants["decay"][0]) for own in touch.plan.sensors}
+    modes = {value.name: (value.constants["frequency"][0], value.constants["decay"][0]) for value in touch.plan.sensors}
     return cut, balls, first, modes
 
 
@@ -53,23 +53,23 @@ def centroid(sound):
 
 
 def decay(sound):
-    """Return the rate at which amplitudes fall on the whole, by the energy of frames of 6 ms [1/s]."""
+    """Return the overall decay rate of amplitudes [1/s], from energies of 6 ms frames."""
     energy = (sound.reshape(len(sound), 10, -1) ** 2).sum(axis=2)
     return -0.5 * np.polyfit(0.006 * np.arange(10), np.log(energy).T, 1)[0]
 
 
-def test_the_solver_cannot_tell_them_apart(drops):
+def test_balls_bounce_equally_on_all_boxes(drops):
     _, balls, first, _ = drops
     for ball, centre in zip(balls, (-0.3, 0.0, 0.3), strict=True):
         same = ball[:, :3] - [centre, 0, 0]
         np.testing.assert_allclose(same, balls[1][:, :3], atol=1e-9)
-    for name in ("steel", "glass"):  # a ball that is within a rounding of the surface touches it a step later
+    for name in ("steel", "glass"):  # rounding may delay a contact by one step
         assert (np.abs(first[name] // 24 - first["wood"] // 24) <= 1).all()
 
 
 @pytest.mark.parametrize("feature", [centroid, decay])
-def test_every_drop_is_told_apart(drops, feature):
-    """All drops of each: the ranges of the three do not meet, neither of the centroid nor of the decay."""
+def test_features_of_all_drops_separate_the_materials(drops, feature):
+    """The three ranges of centroid and of decay do not overlap."""
     values = {name: feature(sound) for name, sound in drops[0].items()}
     ordered = sorted(values.values(), key=np.median)
     assert all(below.max() < above.min() for below, above in itertools.pairwise(ordered))
@@ -78,9 +78,9 @@ def test_every_drop_is_told_apart(drops, feature):
 
 @pytest.mark.parametrize("name", BOXES)
 def test_peaks_of_the_spectrum_are_at_modes(drops, name):
-    """Of every drop the strong peaks are each at a mode; at least four are in band.
+    """Strong peaks of every drop are at modes, and at least four are in band.
 
-    That is within 1 %, half its width d/2π, and half of the 17 Hz that 60 ms tell apart.
+    Tolerance: 1 %, half the mode's width d/2π, and half the 17 Hz resolution of 60 ms.
     """
     modes, decays = drops[3][name]
     assert len(modes) >= 4
@@ -93,8 +93,8 @@ def test_peaks_of_the_spectrum_are_at_modes(drops, name):
         assert all((np.abs(modes - peak) < allowed).any() for peak in peaks)
 
 
-def test_an_ear_hears_a_box_as_much_later_and_fainter_as_it_is_away():
-    """ρc √(A/4π)/r of the surface's velocity, r/c later, to 5e-3 of the loudest; at the end some is still on its way."""
+def test_an_ear_hears_a_box_delayed_and_attenuated_by_distance():
+    """Expect ρc √(A/4π)/r of the surface's velocity, r/c later, within 5e-3; the last samples are still in flight."""
     touch = tgdsl.compile(EXAMPLE, sensors=["ear"], overrides={"sensors.ear.hears": ["glass"]}, dtype="float64")
     assert [output.name for output in touch.outputs] == ["glass", "ear"]
     sim = tgdsl.simulate(touch, 1)
@@ -102,13 +102,13 @@ def test_an_ear_hears_a_box_as_much_later_and_fainter_as_it_is_away():
     for _ in range(300):
         sim.step()
         readings = touch(sim.state())
-        for name, found in blocks.items():
-            found.append(readings[name][0, :, 0, 0])
-    made, heard = (torch.cat(blocks[name]).numpy() for name in ("glass", "ear"))
+        for name, parts in blocks.items():
+            parts.append(readings[name][0, :, 0, 0])
+    emitted, heard = (torch.cat(blocks[name]).numpy() for name in ("glass", "ear"))
     distance = np.linalg.norm(np.array([0.3, 0, 0.05]) - [0, -0.6, 0.4])
     level = 1.204 * 343.2 * np.sqrt(0.01 / (4 * np.pi)) / distance
-    num = 2 * len(made)
-    turn = np.exp(-2j * np.pi * np.fft.rfftfreq(num, 1 / RATE) * distance / 343.0)
-    expected = level * np.fft.irfft(np.fft.rfft(made, num) * turn, num)[: len(heard)]
+    num = 2 * len(emitted)
+    phase = np.exp(-2j * np.pi * np.fft.rfftfreq(num, 1 / RATE) * distance / 343.0)
+    expected = level * np.fft.irfft(np.fft.rfft(emitted, num) * phase, num)[: len(heard)]
     assert np.abs(expected).max() > 1.0
     assert np.abs(heard - expected)[:-300].max() < 5e-3 * np.abs(expected).max()

@@ -1,4 +1,4 @@
-"""The example package: a kind with rows of its own, memory and no objects, and a quantity, both from outside tgdsl."""
+"""The example package: a kind with custom rows, memory and no objects, and a quantity, both outside tgdsl."""
 
 import dataclasses
 import json
@@ -17,7 +17,7 @@ from tgdsl.files.plugins import installed
 from tgdsl.testing import KindConformance
 
 PLUGINS = Path(__file__).parents[2] / "examples" / "plugins"
-sys.path.append(str(PLUGINS))  # as its own package has it
+sys.path.append(str(PLUGINS))  # as in its package
 
 from accelerometer import ACCELEROMETER  # noqa: E402
 from dipoles import HALL, MAGNETIC_FIELD, MU  # noqa: E402
@@ -31,7 +31,7 @@ GRAVITY = 9.81
 
 class TestAccelerometer(KindConformance):
     kind = ACCELEROMETER
-    parameters = {"cutoff": 20.0, "gravity": [0, 0, 0]}  # with gravity a turned scene reads otherwise, as it must
+    parameters = {"cutoff": 20.0, "gravity": [0, 0, 0]}  # with gravity, readings of a rotated scene differ
     gates = ()
 
 
@@ -65,7 +65,7 @@ def build(tmp_path):
     return compiled
 
 
-def test_at_rest_it_reads_minus_gravity_in_the_link(build):
+def test_at_rest_an_accelerometer_reads_minus_gravity_in_the_link(build):
     touch = build(imu={"kind": "accelerometer", "links": "pad"})
     sim = tgdsl.simulate(touch, num_envs=2)
     sim.step()
@@ -73,7 +73,7 @@ def test_at_rest_it_reads_minus_gravity_in_the_link(build):
     np.testing.assert_allclose(touch(sim.state())["imu"], np.broadcast_to(expected, (2, 1, 3)), rtol=1e-12, atol=1e-12)
 
 
-def test_in_free_fall_it_reads_nothing(build):
+def test_in_free_fall_an_accelerometer_reads_zero(build):
     touch = build(imu={"kind": "accelerometer", "links": "item", "cutoff": 1e4})
     sim = tgdsl.simulate(touch, num_envs=1)
     for _ in range(5):
@@ -83,7 +83,7 @@ def test_in_free_fall_it_reads_nothing(build):
 
 
 def test_the_low_pass_answers_a_step_exponentially(build):
-    """A velocity that grows evenly from the second call on: y = a (1 − e^(−2π f_c t)) beside −g, at any step."""
+    """Constant acceleration from the second call: y = a (1 − e^(−2π f_c t)), minus gravity, at every step."""
     touch = build(imu={"kind": "accelerometer", "links": "pad", "cutoff": 5.0})
     state = touch.example_state(1)
     state.body_quat[:] = torch.tensor([1.0, 0, 0, 0])
@@ -94,35 +94,35 @@ def test_the_low_pass_answers_a_step_exponentially(build):
         np.testing.assert_allclose(read, [expected, expected, GRAVITY + expected], rtol=1e-12, atol=1e-12)
 
 
-def test_a_block_holds_what_single_readings_at_each_physics_step_are(build):
+def test_a_block_holds_the_readings_of_each_physics_step(build):
     spec = {"kind": "accelerometer", "links": ["item", "pad"], "cutoff": 40.0}
     block, single = build(imu={**spec, "substeps": 4}), build(imu=spec)
-    both = tgdsl.simulate(block, num_envs=2, substeps=4), tgdsl.simulate(single, num_envs=2, substeps=4)
-    start = block(both[0].state())["imu"]
-    torch.testing.assert_close(start, single(both[1].state())["imu"][:, None].expand(-1, 4, -1, -1), rtol=0, atol=0)
+    sims = tgdsl.simulate(block, num_envs=2, substeps=4), tgdsl.simulate(single, num_envs=2, substeps=4)
+    start = block(sims[0].state())["imu"]
+    torch.testing.assert_close(start, single(sims[1].state())["imu"][:, None].expand(-1, 4, -1, -1), rtol=0, atol=0)
     for _ in range(3):
-        both[0].step()
-        each = [single(state)["imu"] for state in both[1].substates()]
-        torch.testing.assert_close(block(both[0].state())["imu"], torch.stack(each, dim=1), rtol=0, atol=1e-12)
+        sims[0].step()
+        singles = [single(state)["imu"] for state in sims[1].substates()]
+        torch.testing.assert_close(block(sims[0].state())["imu"], torch.stack(singles, dim=1), rtol=0, atol=1e-12)
     assert block.outputs[0].shape == (4, 2, 3) and block.outputs[0].rows == "imu"
     assert block.rows["imu"]["link"].tolist() == ["pad", "item"]  # in the robot's order
 
 
-def test_after_a_reset_a_block_holds_nothing_of_the_episode_before(build):
+def test_a_reset_clears_blocks(build):
     touch = build(imu={"kind": "accelerometer", "links": "item", "substeps": 3})
     sim = tgdsl.simulate(touch, num_envs=3, substeps=3)
     for _ in range(4):
         sim.step()
-        before = touch(sim.state())["imu"]
+        previous = touch(sim.state())["imu"]
     sim.reset([1])
     state = sim.state()
-    now = touch(state, env_ids=[1])["imu"]
-    torch.testing.assert_close(now[[0, 2]], before[[0, 2]], rtol=0, atol=0)
+    current = touch(state, env_ids=[1])["imu"]
+    torch.testing.assert_close(current[[0, 2]], previous[[0, 2]], rtol=0, atol=0)
     assert all(torch.equal(part.body_linvel[1], state.body_linvel[1]) for part in state.substeps)
-    np.testing.assert_allclose(now[1], np.broadcast_to([0, 0, GRAVITY], (3, 1, 3)), atol=1e-12)
+    np.testing.assert_allclose(current[1], np.broadcast_to([0, 0, GRAVITY], (3, 1, 3)), atol=1e-12)
 
 
-def test_a_block_wants_the_states_of_all_its_physics_steps(build):
+def test_a_block_needs_the_states_of_all_its_physics_steps(build):
     touch = build(imu={"kind": "accelerometer", "links": "item", "substeps": 3})
     state = touch.example_state(2)
     with pytest.raises(StateError, match="substeps holds 1 states, expected 2"):
@@ -137,7 +137,7 @@ def test_a_block_has_no_history(build):
         build(imu={"kind": "accelerometer", "links": "item", "substeps": 3, "history": 2})
 
 
-def test_blocks_of_a_document_are_of_one_length_and_have_no_clean_reading(build):
+def test_blocks_have_one_length_and_no_clean_reading(build):
     block = {"kind": "accelerometer", "links": "item", "substeps": 3}
     with pytest.raises(SpecError, match=r'sensors\.b: it is advanced at 2 physics steps of a call, "a" at 3'):
         build(a=block, b={**block, "substeps": 2})
@@ -145,32 +145,35 @@ def test_blocks_of_a_document_are_of_one_length_and_have_no_clean_reading(build)
         build(a={**block, "readout": "both"})
 
 
-def test_after_substates_the_earlier_states_are_theirs(build):
+def test_substates_give_the_earlier_states_of_a_step(build):
     sims = [tgdsl.simulate(build(a={"kind": "accelerometer", "links": "item", "substeps": 3}), 2, substeps=3) for _ in range(2)]
     for sim in sims:
         sim.step()
     sims[0].step()
     states = list(sims[1].substates())
-    found, expected = (sim.state() for sim in sims[::-1])
-    for one, other in zip((*found.substeps, found), (*expected.substeps, expected), strict=True):
-        assert torch.equal(one.body_pos, other.body_pos)
-    assert all(torch.equal(one.body_pos, other.body_pos) for one, other in zip(found.substeps, states, strict=False))
+    after_substates, expected = (sim.state() for sim in sims[::-1])
+    for actual, reference in zip((*after_substates.substeps, after_substates), (*expected.substeps, expected), strict=True):
+        assert torch.equal(actual.body_pos, reference.body_pos)
+    assert all(
+        torch.equal(actual.body_pos, reference.body_pos)
+        for actual, reference in zip(after_substates.substeps, states, strict=False)
+    )
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_of_a_fault_the_other_environments_make_their_whole_step(build):
-    places = []
+def test_a_fault_does_not_shorten_the_step_of_other_environments(build):
+    positions = []
     for substeps in (0, 3):
         sim = tgdsl.simulate(build(a={"kind": "accelerometer", "links": "item", "substeps": substeps}), 3, substeps=3)
         sim.step()
         sim.qvel[1] = 1e30
         with pytest.raises(SimulationError, match="environments 1 diverged"):
             sim.step()
-        places.append(sim.qpos[[0, 2]].clone())
-    assert torch.equal(*places)
+        positions.append(sim.qpos[[0, 2]].clone())
+    assert torch.equal(*positions)
 
 
-def test_substeps_that_are_no_states_are_refused(build):
+def test_invalid_substeps_are_refused(build):
     touch = build(a={"kind": "accelerometer", "links": "item", "substeps": 3})
     state = touch.example_state(1)
     for wrong in (None, (1, 2)):
@@ -206,7 +209,7 @@ WRONG_QUANTITIES = {
 
 
 @pytest.mark.parametrize("message", WRONG_QUANTITIES)
-def test_what_is_wrong_with_a_quantity_is_named(build, message):
+def test_mistakes_in_a_quantity_are_named(build, message):
     def read():
         touch = build(kinds=[WRONG_QUANTITIES[message]], hall={"kind": "hall", "links": "pad", "feels": ["item"]})
         return touch(touch.example_state(2))
@@ -216,20 +219,20 @@ def test_what_is_wrong_with_a_quantity_is_named(build, message):
     assert message in str(error.value)
 
 
-def test_a_peek_and_a_loaded_state_go_on_alike(build, tmp_path):
+def test_a_peek_and_a_loaded_state_read_the_same(build, tmp_path):
     touch = build(imu={"kind": "accelerometer", "links": "item", "cutoff": 30.0})
     first, second = (touch.example_state(2, seed=seed) for seed in (0, 1))
     touch(first)
-    seen = touch.peek(second)["imu"]
+    peeked = touch.peek(second)["imu"]
     tgdsl.save(touch, tmp_path / "a.safetensors")
-    again = tgdsl.load(tmp_path / "a.safetensors", kinds=[ACCELEROMETER], dtype="float64")
-    again.load_state_dict(touch.state_dict())
-    for found in (touch(second)["imu"], again(second)["imu"]):
-        torch.testing.assert_close(found, seen, rtol=0, atol=0)
+    loaded = tgdsl.load(tmp_path / "a.safetensors", kinds=[ACCELEROMETER], dtype="float64")
+    loaded.load_state_dict(touch.state_dict())
+    for reading in (touch(second)["imu"], loaded(second)["imu"]):
+        torch.testing.assert_close(reading, peeked, rtol=0, atol=0)
 
 
-def test_a_dipole_on_its_axis_and_beside_it(build):
-    """B = μ₀/4π 2m/r³ along the axis, −μ₀/4π m/r³ across it, and nothing beyond the range."""
+def test_a_dipoles_field_matches_the_closed_form(build):
+    """B = μ₀/4π 2m/r³ along the axis, −μ₀/4π m/r³ across it, and 0 beyond the range."""
     touch = build(hall={"kind": "hall", "links": "pad", "feels": ["item"], "moment": [0, 0, 0.3], "range": 1.0})
     state = touch.example_state(3)
     state.body_quat[:] = torch.tensor([1.0, 0, 0, 0])
@@ -240,13 +243,13 @@ def test_a_dipole_on_its_axis_and_beside_it(build):
     np.testing.assert_allclose(touch(state)["hall"][:, 0], expected, rtol=1e-12, atol=1e-18)
 
 
-def test_an_artefact_without_its_quantity_says_so(build, tmp_path):
+def test_an_artefact_without_its_quantity_is_refused(build, tmp_path):
     tgdsl.save(build(hall={"kind": "hall", "links": "pad", "feels": ["item"]}), tmp_path / "a.safetensors")
     with pytest.raises(ArtifactError, match='asks for the quantity "magnetic_field", which is not known'):
         tgdsl.load(tmp_path / "a.safetensors")
 
 
-def test_installed_they_are_there_in_documents_commands_and_the_schema(tmp_path, monkeypatch, here):
+def test_installed_plugins_appear_in_documents_commands_and_the_schema(tmp_path, monkeypatch, here):
     info = tmp_path / "tgdsl_plugins_example-0.1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: tgdsl-plugins-example\nVersion: 0.1.0\n")
@@ -261,8 +264,8 @@ def test_installed_they_are_there_in_documents_commands_and_the_schema(tmp_path,
         code, out, errors = here(tmp_path, "explain", "a.safetensors")
         assert code == 0 and "poses and velocities of its links" in out
         assert here(tmp_path, "schema")[0] == 0
-        known = json.loads((tmp_path / "tgdsl.schema.json").read_text())["$defs"]
-        assert {"AccelerometerSpec", "HallSpec"} <= known.keys()
+        definitions = json.loads((tmp_path / "tgdsl.schema.json").read_text())["$defs"]
+        assert {"AccelerometerSpec", "HallSpec"} <= definitions.keys()
     finally:
         installed.cache_clear()
 
@@ -280,7 +283,7 @@ def test_both_simulators_read_the_same(build):
     for _ in range(3):
         for sim in sims:
             sim.step()
-        found, expected = warp(sims[1].state()), batch(sims[0].state())
+        actual, expected = warp(sims[1].state()), batch(sims[0].state())
         for name in expected:
             scale = float(expected[name].abs().max())
-            torch.testing.assert_close(found[name], expected[name], rtol=0, atol=2e-3 * scale)
+            torch.testing.assert_close(actual[name], expected[name], rtol=0, atol=2e-3 * scale)

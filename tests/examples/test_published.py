@@ -1,4 +1,4 @@
-"""The published documents: each can be learned on a CPU, and students can be taught what was learned."""
+"""The published documents: teachers and students can learn each on a CPU."""
 
 import csv
 import json
@@ -14,7 +14,7 @@ pytestmark = [pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 FEW = {"in_palm_rotate": (), "in_hand_repose": (), "screwdriver": ("grasps.num=8",)}
 
 
-def test_each_document_is_tried():
+def test_each_document_is_tested():
     assert {file.stem for file in FOLDER.glob("*.yaml")} == FEW.keys()
 
 
@@ -22,14 +22,14 @@ def test_each_document_is_tried():
 @pytest.mark.parametrize("name", FEW)
 def test_a_teacher_and_its_students_learn_a_few_iterations(name, tmp_path):
     document, out = FOLDER / f"{name}.yaml", tmp_path / "teacher"
-    few = (*FEW[name], "train.steps=4", "distill.steps=4")
-    Train(document, device="cpu", envs=2, iterations=1, episodes=0, out=out, set=few).run()
+    overrides = (*FEW[name], "train.steps=4", "distill.steps=4")
+    Train(document, device="cpu", envs=2, iterations=1, episodes=0, out=out, set=overrides).run()
     card = json.loads((out / "policy.json").read_text())
     goal = {"in_palm_rotate": 1, "in_hand_repose": 13}
     assert card["groups"].get("goal") == goal.get(name) and card["groups"]["priv_touch"] == 15
     students = tmp_path / "students"
     options = {"device": "cpu", "types": "none,agg_bool,force", "seeds": 1, "envs": 48, "iterations": 2, "episodes": 0}
-    Distill(document, teacher=out / "policy.pt", out=students, set=few, **options).run()
+    Distill(document, teacher=out / "policy.pt", out=students, set=overrides, **options).run()
     with (students / "med" / "curve.csv").open(newline="") as opened:
         rows = list(csv.DictReader(opened))
     losses = [float(value) for name, value in rows[-1].items() if name.startswith("Loss/") and name.endswith("s0")]

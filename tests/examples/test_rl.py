@@ -1,4 +1,4 @@
-"""The examples of skrl and Stable-Baselines3: they train on what the hand has, and are told how episodes end."""
+"""The examples of skrl and Stable-Baselines3 train on the hand's observations and learn how episodes end."""
 
 import runpy
 from pathlib import Path
@@ -19,8 +19,8 @@ def task(tmp_path):
     return str(small_task(tmp_path))
 
 
-def test_skrl(task, tmp_path):
-    """After 24 steps it has learned once: what it sees are 6 + 4 + 7 numbers."""
+def test_skrl_learns(task, tmp_path):
+    """After 24 steps it has learned once, from 6 + 4 + 7 observations."""
     example = runpy.run_path(str(EXAMPLES / "skrl_ppo.py"))
     agent = example["main"](["--task", task, "--envs", "4", "--steps", "24", "--out", str(tmp_path / "out")])
     assert agent.policy.num_observations == 17
@@ -28,7 +28,7 @@ def test_skrl(task, tmp_path):
     assert changed and all(weight.isfinite().all() for weight in agent.policy.parameters())
 
 
-def test_stable_baselines3(task, capsys):
+def test_stable_baselines3_learns(task, capsys):
     example = runpy.run_path(str(EXAMPLES / "stable_baselines3_ppo.py"))
     model = example["main"](["--task", task, "--envs", "4", "--steps", "24"])
     assert list(model.observation_space.spaces) == ["proprio", "tactile_sensors", "goal"]
@@ -37,8 +37,8 @@ def test_stable_baselines3(task, capsys):
 
 
 @pytest.mark.filterwarnings("ignore:environments had faults")
-def test_stable_baselines3_is_told_how_episodes_end(task):
-    """Environment 1 ends for good by an action that is not finite, the others after 8 steps."""
+def test_stable_baselines3_distinguishes_ends_of_episodes(task):
+    """Environment 1 terminates by a non-finite action, the others are truncated after 8 steps."""
     example = runpy.run_path(str(EXAMPLES / "stable_baselines3_ppo.py"))
     touch_env = TouchEnv(task, 3)
     env = example["Sb3VecEnv"](TouchVectorEnv(touch_env))
@@ -57,7 +57,7 @@ def test_stable_baselines3_is_told_how_episodes_end(task):
             assert set(info["terminal_observation"]) == set(obs)
         assert [bool(info) for info in infos] == done.tolist()
     assert ends == {1: (2, False, 3), 0: (7, True, 8), 2: (7, True, 8)}
-    again = touch_env.reset(5)  # the first of the seeds
-    assert all(torch.equal(again[name], torch.from_numpy(value)) for name, value in first.items())
+    observation = touch_env.reset(5)  # the first of the seeds
+    assert all(torch.equal(observation[name], torch.from_numpy(value)) for name, value in first.items())
     assert (env.get_attr("num_envs"), env.env_is_wrapped(dict)) == ([3] * 3, [False] * 3)
     env.close()

@@ -1,4 +1,4 @@
-"""Which bodies can collide, against MuJoCo itself."""
+"""Which bodies can collide, against MuJoCo."""
 
 import mujoco
 import pytest
@@ -89,15 +89,15 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_can_collide_is_what_mujoco_does(tmp_path, case):
+def test_can_collide_matches_mujoco(tmp_path, case):
     text, expected = CASES[case]
     (tmp_path / "scene.xml").write_text(text)
     model = load_model(tmp_path / "scene.xml")
     first, second = ("a" if "a" in model.bodies else "world"), "b"
     data = mujoco.MjData(model.compiled)
     mujoco.mj_forward(model.compiled, data)
-    wanted = {model.compiled.body(first).id, model.compiled.body(second).id}
+    body_ids = {model.compiled.body(first).id, model.compiled.body(second).id}
     bodies = [{int(b) for b in model.compiled.geom_bodyid[[c.geom1, c.geom2]]} for c in data.contact]
-    assert (wanted in bodies) is expected  # MuJoCo, which is the oracle, agrees with the table
+    assert (body_ids in bodies) is expected  # the oracle, MuJoCo, agrees with the table
     assert model.can_collide(first, second) is expected
     assert model.can_collide(second, first) is expected

@@ -1,4 +1,4 @@
-"""Mesh files that MuJoCo does not read: at their place, in their size, named once, carried by artefacts by content."""
+"""Mesh files that MuJoCo does not read: placed, scaled, named once and embedded in artefacts."""
 
 import json
 import sys
@@ -27,7 +27,7 @@ def small() -> trimesh.Trimesh:
 
 
 def two_nodes() -> tuple[trimesh.Scene, np.ndarray]:
-    """Return a scene of one mesh at two nodes, one below the other, and where its vertices are."""
+    """Return a scene of one mesh at two nested nodes, and its vertices."""
     first, second = np.eye(4), np.eye(4)
     first[:3, :3], first[:3, 3] = Rotation.from_euler("xyz", [0.3, -0.4, 0.5]).as_matrix(), [0.01, 0.02, 0.03]
     second[:3, 3] = [0.0, 0.0, 0.05]
@@ -39,7 +39,7 @@ def two_nodes() -> tuple[trimesh.Scene, np.ndarray]:
 
 
 def written(scene: trimesh.Scene, folder: Path, name: str) -> None:
-    if name.endswith(".gltf"):  # its numbers are in files beside it
+    if name.endswith(".gltf"):  # its buffers are separate files
         for file, content in scene.export(file_type="gltf").items():
             (folder / (name if file == "model.gltf" else file)).write_bytes(content)
     elif name.endswith(".glb"):
@@ -70,39 +70,39 @@ def loaded(path: Path) -> tuple[Model, list[str]]:
 
 @pytest.mark.parametrize("ending", ["glb", "gltf", "GLB", "ply", "off"])
 @pytest.mark.parametrize("scale", [(1.0, 1.0, 1.0), (2.0, -1.0, 0.5)])
-def test_urdf_meshes_are_at_their_place(tmp_path, ending, scale):
+def test_urdf_meshes_are_placed_and_scaled(tmp_path, ending, scale):
     scene, points = two_nodes()
     written(scene, tmp_path, f"a part.{ending.lower()}")
     (tmp_path / f"a part.{ending.lower()}").rename(tmp_path / f"a part.{ending}")
     path = urdf_of(
         tmp_path, f"<mesh filename='a part.{ending}' scale='{' '.join(map(str, scale))}'/>", "<sphere radius='.01'/>"
     )
-    model, said = loaded(path)
+    model, messages = loaded(path)
     rotation = Rotation.from_euler("z", 1.5).as_matrix()
     assert nearest(trimesh_of(model, "link0").vertices, (points * scale) @ rotation.T + [0.1, 0, 0]) < MESH_TOLERANCE
     axes = " and with Y not turned up to Z" if ending.lower() in ("glb", "gltf") else ""
-    assert said == [f"{path}: {READ_BY_TRIMESH}{axes}: a part.{ending}"]
+    assert messages == [f"{path}: {READ_BY_TRIMESH}{axes}: a part.{ending}"]
 
 
-def test_a_mesh_is_as_closed_as_its_file_says_whatever_its_seams(tmp_path):
-    """GlTF stores a vertex once for each normal at it; as a solid it is one."""
+def test_seams_of_normals_do_not_open_a_mesh(tmp_path):
+    """GlTF stores a vertex once per normal; the solid merges them."""
     mesh = small()
     seams = trimesh.Trimesh(
         mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3), process=False
     )
     trimesh.Scene(seams).export(tmp_path / "a.glb")
     model, _ = loaded(urdf_of(tmp_path, "<mesh filename='a.glb'/>"))
-    found = trimesh_of(model, "link0")
-    assert found.is_watertight and len(found.vertices) == len(mesh.vertices)
-    assert found.volume == pytest.approx(mesh.volume, rel=1e-5)
+    result = trimesh_of(model, "link0")
+    assert result.is_watertight and len(result.vertices) == len(mesh.vertices)
+    assert result.volume == pytest.approx(mesh.volume, rel=1e-5)
 
 
-def test_files_of_one_stem_are_told_apart_and_named_once(tmp_path):
+def test_files_with_one_stem_stay_separate_and_are_named_once(tmp_path):
     small().export(tmp_path / "part.stl")
     trimesh.Scene(trimesh.creation.box([0.02, 0.04, 0.06])).export(tmp_path / "part.glb")
     meshes = [f"<mesh filename='part.{ending}'/>" for ending in ("stl", "glb", "glb")]
-    model, said = loaded(urdf_of(tmp_path, *meshes))
-    assert len(said) == 1 and said[0].endswith(": part.glb")
+    model, messages = loaded(urdf_of(tmp_path, *meshes))
+    assert len(messages) == 1 and messages[0].endswith(": part.glb")
     assert trimesh_of(model, "link0").volume == pytest.approx(small().volume, rel=1e-4)
     for link in ("link1", "link2"):
         assert trimesh_of(model, link).volume == pytest.approx(0.02 * 0.04 * 0.06, rel=1e-5)
@@ -120,7 +120,7 @@ def test_a_flat_visual_is_read(tmp_path, ending):
     assert trimesh_of(model, "a").area == pytest.approx(0.01)
 
 
-def test_an_artefact_carries_them_by_content(tmp_path, monkeypatch):
+def test_an_artefact_embeds_meshes(tmp_path, monkeypatch):
     two_nodes()[0].export(tmp_path / "a.glb")
     urdf_of(tmp_path, "<mesh filename='a.glb'/>")
     document = {
@@ -163,7 +163,7 @@ def _draco(folder: Path) -> None:
         ("a.step", lambda folder: (folder / "a.step").write_text(""), 'mesh "a.step": expected one of .stl, .obj, .msh, .glb'),
     ],
 )
-def test_what_cannot_be_read_is_named(tmp_path, name, write, what):
+def test_unreadable_meshes_are_named(tmp_path, name, write, what):
     write(tmp_path)
     path = urdf_of(tmp_path, f"<mesh filename='{name}'/>")
     with pytest.raises(RobotError, match=r"my hand\.urdf|a\.") as caught:
@@ -171,7 +171,7 @@ def test_what_cannot_be_read_is_named(tmp_path, name, write, what):
     assert what in str(caught.value) and name in str(caught.value)
 
 
-def test_collada_says_which_package_it_needs(tmp_path, monkeypatch):
+def test_collada_without_its_package_names_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "collada", None)
     (tmp_path / "a.dae").write_text("<COLLADA/>")
     with pytest.raises(
@@ -180,16 +180,16 @@ def test_collada_says_which_package_it_needs(tmp_path, monkeypatch):
         load_model(urdf_of(tmp_path, "<mesh filename='a.dae'/>"))
 
 
-def test_mjcf_that_names_them_says_what_to_do(tmp_path):
+def test_mjcf_with_such_meshes_is_refused_with_advice(tmp_path):
     trimesh.Scene(small()).export(tmp_path / "a.glb")
     with pytest.raises(RobotError) as caught:
         model_of(tmp_path, "<geom type='mesh' mesh='a'/>", "<mesh file='a.glb'/>")
-    how = "convert them, such as by trimesh.load_scene(FILE).to_mesh().export(OTHER)"
-    assert str(caught.value) == f"{tmp_path / 'robot.xml'}: MJCF's meshes are files of .stl, .obj, .msh, found a.glb; {how}"
+    advice = "convert them, such as by trimesh.load_scene(FILE).to_mesh().export(OTHER)"
+    assert str(caught.value) == f"{tmp_path / 'robot.xml'}: MJCF's meshes are files of .stl, .obj, .msh, found a.glb; {advice}"
 
 
 def two_boxes(mark: str) -> str:
-    """An OBJ file of two boxes of 1 cm side by side, each an object or group of its own."""
+    """Return an OBJ file of two 1 cm boxes side by side, each a separate object or group."""
     text, first = "# by hand\n", 1
     for i in range(2):
         box = trimesh.creation.box((0.01, 0.01, 0.01))
@@ -200,10 +200,10 @@ def two_boxes(mark: str) -> str:
     return text
 
 
-@pytest.mark.filterwarnings("ignore::tgdsl.errors.UnfeltWarning")  # those between the boxes are within their convex hull
+@pytest.mark.filterwarnings("ignore::tgdsl.errors.UnfeltWarning")  # taxels between the boxes lie in their convex hull
 @pytest.mark.parametrize("mark", ["o", "g"])
-def test_an_obj_file_of_several_objects_is_read_whole(tmp_path, mark):
-    """MuJoCo by itself reads the first: half of the faces, and half of the surface that taxels would be sampled on."""
+def test_all_objects_of_an_obj_file_are_read(tmp_path, mark):
+    """MuJoCo alone reads the first: half of the faces."""
     (tmp_path / "two.obj").write_text(two_boxes(mark))
     scene = f"""<mujoco><asset><mesh file="{tmp_path / "two.obj"}"/></asset><worldbody>
       <body name="hand"><geom type="mesh" mesh="two"/></body></worldbody></mujoco>"""
@@ -230,7 +230,7 @@ def test_an_obj_file_of_several_objects_is_read_whole(tmp_path, mark):
     assert scene_model(touch.plan.scene).mesh_facenum.tolist() == [24]
 
 
-def test_a_file_of_mjcf_whose_name_is_in_another_case_is_named(tmp_path):
+def test_a_missing_file_of_mjcf_names_one_in_another_case(tmp_path):
     small().export(tmp_path / "finger.stl")
     body = '<body name="a"><geom type="mesh" mesh="m"/></body>'
     text = f'<mujoco><asset><mesh name="m" file="Finger.STL"/></asset><worldbody>{body}</worldbody></mujoco>'

@@ -1,4 +1,4 @@
-"""Robot files: surfaces against closed forms, meshes at their original place, mistakes told."""
+"""Robot files: surfaces against closed forms, meshes in their original pose, and error messages."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from tgdsl.surfaces.geom import Geom
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 TESSELLATION = 0.01
-"""Round shapes are inscribed polyhedra: 96 sections lack 0.14 %, an icosphere of 2,562 vertices 0.3 %, 64 × 64 0.5 %."""
+"""Round shapes are inscribed polyhedra: 96 sections lack 0.14 %, a sphere of 2,562 vertices 0.3 %, 64 × 64 0.5 %."""
 MOUNT = "pos='.01 -.02 .03' quat='.9 .1 -.3 .2'"
 MOUNT_POS = np.array([0.01, -0.02, 0.03])
 MOUNT_ROTATION = Rotation.from_quat([0.9, 0.1, -0.3, 0.2], scalar_first=True).as_matrix()
@@ -44,7 +44,7 @@ def test_surfaces_of_primitives(tmp_path, shape, mount):
     mesh = trimesh_of(model_of(tmp_path, f"<geom type='{shape}' size='{text}' {mount}/>"))
     assert mesh.is_watertight
     assert mesh.is_winding_consistent
-    assert volume * (1 - TESSELLATION) <= mesh.volume <= volume * (1 + 1e-9)  # inscribed, and faces look outwards
+    assert volume * (1 - TESSELLATION) <= mesh.volume <= volume * (1 + 1e-9)  # inscribed, with outward faces
     if area is not None:
         assert area * (1 - TESSELLATION) <= mesh.area <= area * (1 + 1e-9)
     pos, rotation = (MOUNT_POS, MOUNT_ROTATION) if mount else (np.zeros(3), np.eye(3))
@@ -59,23 +59,23 @@ def test_ellipsoid_vertices_are_on_it(tmp_path):
     np.testing.assert_allclose(((mesh.vertices / [0.02, 0.01, 0.03]) ** 2).sum(axis=1), 1, rtol=1e-9)
 
 
-def test_fromto_and_compiler_angles_are_mujocos(tmp_path):
+def test_fromto_of_capsules_is_applied(tmp_path):
     mesh = trimesh_of(model_of(tmp_path, "<geom type='capsule' size='.01' fromto='.01 0 0 .05 0 0'/>"))
     np.testing.assert_allclose(mesh.bounds, [[0, -0.01, -0.01], [0.06, 0.01, 0.01]], atol=3e-5)
 
 
 @pytest.mark.parametrize("scale", ["", "scale='1e-3 1e-3 1e-3'", "scale='2e-3 -1e-3 1e-3'"], ids=["metres", "mm", "mirrored"])
-def test_meshes_come_back_at_their_place(tmp_path, scale):
+def test_meshes_keep_their_original_pose(tmp_path, scale):
     solid = wedge()
     if not scale:
         solid.apply_scale(1e-3)
     solid.export(tmp_path / "wedge.stl")
     factor = {"": [1, 1, 1], "scale='1e-3 1e-3 1e-3'": [1e-3] * 3}.get(scale, [2e-3, -1e-3, 1e-3])
     model = model_of(tmp_path, f"<geom type='mesh' mesh='wedge' {MOUNT}/>", f"<mesh file='wedge.stl' {scale}/>")
-    assert np.abs(model.compiled.mesh_pos).max() > 1e-3  # MuJoCo has moved it, or this would test nothing
-    found, expected = trimesh_of(model), (solid.vertices * factor) @ MOUNT_ROTATION.T + MOUNT_POS
-    assert nearest(found.vertices, expected) < MESH_TOLERANCE
-    np.testing.assert_allclose(found.volume, solid.volume * abs(np.prod(factor)), rtol=1e-5)
+    assert np.abs(model.compiled.mesh_pos).max() > 1e-3  # MuJoCo has moved it
+    result, expected = trimesh_of(model), (solid.vertices * factor) @ MOUNT_ROTATION.T + MOUNT_POS
+    assert nearest(result.vertices, expected) < MESH_TOLERANCE
+    np.testing.assert_allclose(result.volume, solid.volume * abs(np.prod(factor)), rtol=1e-5)
 
 
 def test_two_meshes_and_a_primitive_on_one_body(tmp_path):
@@ -103,12 +103,12 @@ def test_names_of_bodies_and_geoms(tmp_path):
         ("pad", "sphere", ("tip",)),
     ]
     assert [geom.shown for geom in model.geoms[1:]] == ['geom "wedge"', 'geom "tip"']
-    assert [geom.names for geom in model.touchable("pad")] == [("wedge",)]  # the sphere is only seen
+    assert [geom.names for geom in model.touchable("pad")] == [("wedge",)]  # the sphere is visual
 
 
-def test_a_body_that_collides_nowhere_is_touchable_all_over(tmp_path):
-    seen = "contype='0' conaffinity='0'"
-    model = model_of(tmp_path, f"<geom name='a' size='.01' {seen}/><geom name='b' size='.01' {seen}/>")
+def test_all_geoms_of_a_body_without_colliders_are_touchable(tmp_path):
+    visual = "contype='0' conaffinity='0'"
+    model = model_of(tmp_path, f"<geom name='a' size='.01' {visual}/><geom name='b' size='.01' {visual}/>")
     assert [geom.name for geom in model.touchable("pad")] == ["a", "b"]
     assert model.touchable("world") == ()
 
@@ -136,7 +136,7 @@ def test_unbounded_surfaces_are_refused(tmp_path, geom, shown):
     ],
     ids=["broken", "element", "attribute", "reference", "file", "compile"],
 )
-def test_what_mujoco_refuses_is_told_with_file_and_element(tmp_path, text, parts):
+def test_errors_of_mujoco_name_file_and_element(tmp_path, text, parts):
     (tmp_path / "bad.xml").write_text(text)
     with pytest.raises(RobotError) as caught:
         load_model(tmp_path / "bad.xml")
@@ -146,13 +146,13 @@ def test_what_mujoco_refuses_is_told_with_file_and_element(tmp_path, text, parts
     assert all(part in message for part in parts)
 
 
-def test_a_file_that_is_no_robot_is_refused_by_what_is_expected(tmp_path):
+def test_other_files_are_refused(tmp_path):
     (tmp_path / "hand.yaml").write_text("tgdsl: 1\n")
     with pytest.raises(RobotError, match=r"hand\.yaml: this is no robot or scene file, expected MJCF, URDF or USD$"):
         load_model(tmp_path / "hand.yaml")
 
 
-def test_files_that_a_model_is_made_of(tmp_path):
+def test_included_and_attached_files_are_listed(tmp_path):
     (tmp_path / "hand").mkdir()
     (tmp_path / "hand" / "hand.xml").write_text(
         "<mujoco><worldbody><body name='hand'><geom size='.1'/></body></worldbody></mujoco>"
@@ -166,14 +166,14 @@ def test_files_that_a_model_is_made_of(tmp_path):
     assert sorted(path.name for path in xml_files(tmp_path / "main.xml")) == ["floor.xml", "hand.xml", "main.xml"]
 
 
-def test_a_geom_is_told_by_what_it_is():
+def test_geoms_are_described_by_name_mesh_or_shape():
     shape = {"id": 3, "body": "b", "shape": "box", "size": np.ones(3), "pos": np.zeros(3), "rotation": np.eye(3)}
     assert Geom(name="", mesh="", is_colliding=True, **shape).shown == "unnamed box geom 3"
     assert Geom(name="", mesh="m", is_colliding=True, **shape).shown == 'geom "m"'
     assert Geom(name="n", mesh="m", is_colliding=True, **shape).names == ("n", "m")
 
 
-def test_every_link_of_the_xhand1_has_a_closed_surface_that_matches_its_files():
+def test_surfaces_of_the_xhand1_are_closed_and_match_its_files():
     model = load_model(ROBOTS / "xhand1" / "xhand1_right.xml")
     carriers = [body for body in model.bodies if body != "world" and model.touchable(body)]
     assert carriers
@@ -188,8 +188,8 @@ def test_every_link_of_the_xhand1_has_a_closed_surface_that_matches_its_files():
                 np.testing.assert_allclose(mesh.area, original.area, rtol=1e-4, err_msg=geom.shown)
 
 
-def test_a_format_is_one_line_of_the_table(tmp_path, monkeypatch):
-    """Its reader is asked by a file's ending, whatever its case, or by its root element; its writer by the ending of what to write."""
+def test_formats_are_entries_of_tables(tmp_path, monkeypatch):
+    """The reader is chosen by suffix, in any case, or by root element; the writer by the output's suffix."""
     model, written = model_of(tmp_path, "<geom size='.1'/>"), {}
 
     def read(path: Path) -> Model:
@@ -210,7 +210,7 @@ def test_a_format_is_one_line_of_the_table(tmp_path, monkeypatch):
     assert written == {tmp_path / "d.toy": model}
 
 
-def test_a_part_that_models_include_is_told_from_a_model(tmp_path):
+def test_an_included_part_is_no_model(tmp_path):
     part = tmp_path / "hand_assets.xml"
     part.write_text("<mujocoinclude><worldbody/></mujocoinclude>")
     with pytest.raises(RobotError) as caught:

@@ -1,4 +1,4 @@
-"""URDF: meshes found and at their place, inertias mended, mistakes told."""
+"""URDF: meshes found and placed, inertias repaired, and error messages."""
 
 import warnings
 from pathlib import Path
@@ -47,7 +47,7 @@ def joint_of(name: str, parent: str, child: str, kind: str = "fixed") -> str:
         "file://wedge.stl",
     ],
 )
-def test_urdf_meshes_come_back_at_their_place(tmp_path, reference):
+def test_urdf_meshes_keep_their_pose(tmp_path, reference):
     folder = tmp_path / "hand_pkg" / "urdf"
     origin = "<origin xyz='.01 -.02 .03' rpy='.3 -.4 .5'/>"
     mesh = f"<mesh filename='{reference}' scale='.001 .001 .001'/>"
@@ -67,7 +67,7 @@ def test_urdf_meshes_come_back_at_their_place(tmp_path, reference):
 
 
 @pytest.mark.parametrize("reference", ["wedge.STL", "package://hand/wedge.STL"])
-def test_a_mesh_whose_name_has_another_case_is_named(tmp_path, reference):
+def test_a_missing_mesh_names_a_file_in_another_case(tmp_path, reference):
     path = urdf_of(tmp_path / "hand", link_of("palm", f"<mesh filename='{reference}'/>"))
     wedge().export(tmp_path / "hand" / "wedge.stl")
     with pytest.raises(RobotError, match=r"; there is wedge\.stl$"):
@@ -76,7 +76,7 @@ def test_a_mesh_whose_name_has_another_case_is_named(tmp_path, reference):
 
 def test_urdf_primitives_and_joints(tmp_path):
     links = link_of("base", "<box size='.02 .04 .06'/>") + link_of("a", "<cylinder radius='.01' length='.04'/>")
-    path = urdf_of(tmp_path, links + joint_of("j", "base", "a", "revolute"), "hand.xml")  # told by its root, not its name
+    path = urdf_of(tmp_path, links + joint_of("j", "base", "a", "revolute"), "hand.xml")  # recognised by its root element
     model = load_model(path)
     assert model.is_rounded
     assert [geom.shape for geom in model.geoms] == ["box", "cylinder"]
@@ -85,8 +85,8 @@ def test_urdf_primitives_and_joints(tmp_path):
     assert model.compiled.njnt == 1
 
 
-def test_a_fixed_base_does_not_push_its_first_links_away(tmp_path):
-    """A thumb that reaches into the palm; the index, a joint further, collides with it."""
+def test_a_fixed_base_does_not_collide_with_its_first_links(tmp_path):
+    """The thumb reaches into the palm; the index, one joint further, collides with the palm."""
     ball = "<sphere radius='.06'/>"
     links = (
         link_of("palm", ball) + link_of("mount", "<sphere radius='.001'/>") + link_of("thumb", ball) + link_of("index", ball)
@@ -110,14 +110,14 @@ def test_a_fixed_base_does_not_push_its_first_links_away(tmp_path):
     assert mujoco.MjModel.from_xml_string(model.mjcf).nexclude == 1
 
 
-def test_urdf_inertias_are_mended_with_one_warning(tmp_path):
+def test_impossible_inertias_are_repaired_with_one_warning(tmp_path):
     def inertial(*moments: float) -> str:
         attributes = " ".join(f"i{axes}='{m}'" for axes, m in zip(("xx", "yy", "zz", "xy", "xz", "yz"), moments, strict=True))
         return f"<inertial><mass value='.1'/><inertia {attributes}/></inertial>"
 
     inertias = {
         "base": inertial(1e-5, 1e-5, 1e-5, 0, 0, 0),
-        "flat": inertial(1e-5, 1e-5, 2e-5, 0, 0, 0),  # a disc: at the edge of what is possible
+        "flat": inertial(1e-5, 1e-5, 2e-5, 0, 0, 0),  # a disc: the limit of possible inertias
         "zero": inertial(0, 0, 0, 0, 0, 0),
         "long": inertial(1e-6, 1e-6, 1e-5, 0, 0, 0),  # breaks the triangle inequality
         "skew": inertial(1e-5, 1e-5, 1e-5, 2e-5, 0, 0),  # not positive definite
@@ -151,8 +151,8 @@ def test_urdf_links_without_mass_or_moments_can_move(tmp_path):
 
 
 @pytest.mark.parametrize("turn", range(8))
-def test_urdf_inertias_at_the_edge_survive_being_written(tmp_path, turn):
-    """A plate's largest moment is the sum of the others: to six digits it may be larger."""
+def test_urdf_inertias_at_the_limit_survive_writing(tmp_path, turn):
+    """A plate's largest moment is the sum of the others; rounded to six digits it may exceed it."""
     rotation = Rotation.from_euler("xyz", [0.3 * turn, 0.5, 0.7]).as_matrix()
     plate = rotation @ np.diag([1.06853e-5 + 1e-12 * turn, 4.10897e-5, 5.17750e-5 + 1e-12 * turn]) @ rotation.T
     names = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
@@ -160,11 +160,11 @@ def test_urdf_inertias_at_the_edge_survive_being_written(tmp_path, turn):
     inertial = f"<inertial><mass value='.1'/><inertia {moments}/></inertial>"
     links = link_of("base", "<sphere radius='.01'/>") + link_of("plate", "<sphere radius='.01'/>", inertial)
     model = load_model(urdf_of(tmp_path, links + joint_of("j", "base", "plate", "revolute")))
-    again = mujoco.MjModel.from_xml_string(model.mjcf)
-    np.testing.assert_allclose(again.body_inertia, model.compiled.body_inertia, rtol=2e-5)
+    reloaded = mujoco.MjModel.from_xml_string(model.mjcf)
+    np.testing.assert_allclose(reloaded.body_inertia, model.compiled.body_inertia, rtol=2e-5)
 
 
-def test_urdf_geoms_of_one_name_are_numbered(tmp_path, capfd):
+def test_urdf_geoms_with_one_name_are_numbered(tmp_path, capfd):
     def geom(tag: str, name: str) -> str:
         return f"<{tag}{name and f' name={name!r}'}><geometry><sphere radius='.01'/></geometry></{tag}>"
 
@@ -172,13 +172,13 @@ def test_urdf_geoms_of_one_name_are_numbered(tmp_path, capfd):
     two = geom("visual", "shell") + geom("collision", "") + geom("collision", "pad")
     links = f"<link name='a'>{BALL}{one}</link><link name='b'>{BALL}{two}</link>"
     model = load_model(urdf_of(tmp_path, links + joint_of("j", "a", "b", "revolute")))
-    found = {body: sorted(geom.name for geom in model.geoms if geom.body == body) for body in ("a", "b")}
-    assert found == {"a": ["", "pad", "pad_2", "pad_3"], "b": ["", "pad_4", "shell"]}
+    names = {body: sorted(geom.name for geom in model.geoms if geom.body == body) for body in ("a", "b")}
+    assert names == {"a": ["", "pad", "pad_2", "pad_3"], "b": ["", "pad_4", "shell"]}
     assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("declared", ["", " xmlns:drake='http://drake.mit.edu'"])
-def test_urdf_tags_of_other_programs_are_passed_over(tmp_path, declared):
+def test_urdf_tags_of_other_programs_are_ignored(tmp_path, declared):
     foreign = "<drake:collision_filter_group name='g'><drake:member link='base'/></drake:collision_filter_group>"
     path = tmp_path / "hand.urdf"
     body = link_of("base", "<sphere radius='.01'/>").replace("</link>", "<drake:diaphragm/></link>")
@@ -189,7 +189,7 @@ def test_urdf_tags_of_other_programs_are_passed_over(tmp_path, declared):
     assert model.bodies == ("world", "base") and not caught
 
 
-def test_sound_urdf_gives_no_warning(tmp_path):
+def test_valid_urdf_gives_no_warning(tmp_path):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         load_model(urdf_of(tmp_path, link_of("base", "<sphere radius='.01'/>")))
@@ -216,8 +216,8 @@ def test_urdf_errors(tmp_path, text, message):
 
 
 @pytest.mark.parametrize("declared", ["", " xmlns:xacro='http://www.ros.org/wiki/xacro'"])
-def test_xacro_is_told_from_urdf(tmp_path, declared):
-    """Its links stand in files that it includes, so that without them there would be an empty world."""
+def test_xacro_is_refused(tmp_path, declared):
+    """Its links are in included files; without them the world would be empty."""
     path = tmp_path / "hand.urdf.xacro"
     path.write_text(f"<robot name='hand'{declared}><xacro:include filename='fingers.xacro'/></robot>")
     with pytest.raises(RobotError, match=r"this is xacro, make URDF from it: xacro hand\.urdf\.xacro > hand\.urdf"):
@@ -230,14 +230,14 @@ def test_a_mesh_in_another_case_is_named(tmp_path):
         load_model(urdf_of(tmp_path, link_of("a", "<mesh filename='wedge.stl'/>")))
 
 
-def test_a_number_that_is_none_in_a_urdf(tmp_path):
+def test_an_invalid_number_in_a_urdf_is_located(tmp_path):
     bad = BALL.replace("ixx='1e-5'", "ixx='abc'")
     path = urdf_of(tmp_path, link_of("a", "<sphere radius='.01'/>", bad))
     with pytest.raises(RobotError, match=r"hand\.urdf: .*'ixx'.*inertia.*line 1"):
         load_model(path)
 
 
-def test_urdf_meshes_of_one_name_in_two_folders(tmp_path):
+def test_urdf_meshes_with_one_name_in_two_folders_stay_separate(tmp_path):
     for folder, size in (("left", 0.02), ("right", 0.04)):
         (tmp_path / folder).mkdir()
         trimesh.creation.box((size, size, size)).export(tmp_path / folder / "tip.stl")

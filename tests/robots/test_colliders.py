@@ -1,4 +1,4 @@
-"""Primitive colliders of the hands: within 1 mm of the surface where objects touch it, and nothing else of the hand changes."""
+"""Primitive colliders of the hands stay within 1 mm of touched surfaces and change nothing else."""
 
 import runpy
 from dataclasses import dataclass, field
@@ -16,15 +16,15 @@ from tgdsl.schema.load import load_colliders
 
 @dataclass(frozen=True)
 class Hand:
-    """A hand, and what is to be seen of its colliders.
+    """A hand and expectations of its colliders.
 
     Attributes:
         name: Its folder.
         num_meshes: Geoms that are meshes.
-        example: A document that senses it.
+        example: A document with the hand.
         task: The sensors' document of a task.
-        quick: A mesh that is fitted in no time.
-        at_worst: Of links with a few points that are further away [m].
+        quick: A mesh that is fitted quickly.
+        at_worst: Larger deviations of links with a few outliers [m].
     """
 
     name: str
@@ -44,14 +44,14 @@ class Hand:
 
 
 HANDS = (
-    # The thumb's first link at the rim beside a joint, beyond the taxels; the Sharpa Wave's palm in creases of its hollow.
+    # Outliers: the rim of the thumb's first link, beyond the taxels; creases in the hollow of the Sharpa Wave's palm.
     Hand("xhand1", 13, "xhand1_palm.yaml", "palm.yaml", "index_bend", {"thumb_link1": 1.8e-3}),
     Hand("sharpa", 30, "tasks/sharpa_palm.yaml", "sharpa_palm.yaml", "thumb_dp", {"palm_base": 1.8e-3}),
 )
 TOLERANCE = 1e-3
-"""How far primitives may be from the surface where objects touch it [m]."""
+"""How far primitives may be from touched surfaces [m]."""
 ELSEWHERE = 10e-3
-"""The same on backs and flanks, which only have to keep things out [m]."""
+"""The same on backs and flanks [m]."""
 
 
 @pytest.fixture(scope="module", params=HANDS, ids=lambda hand: hand.name)
@@ -71,59 +71,59 @@ def colliders(hand):
 
 def of_mesh(robot, colliders, mesh):
     """Return the first body with a mesh, and its colliders."""
-    body = next(body for body, own in written.meshes(robot).items() if own == mesh)
+    body = next(body for body, body_mesh in written.meshes(robot).items() if body_mesh == mesh)
     return body, [collider for collider in colliders if collider.body == body]
 
 
-def test_where_objects_touch_a_link_primitives_are_within_a_millimetre(hand, robot, colliders):
+def test_primitives_are_within_a_millimetre_of_touched_surfaces(hand, robot, colliders):
     for mesh, link in hand.links.items():
-        _, own = of_mesh(robot, colliders, mesh)
+        _, primitives = of_mesh(robot, colliders, mesh)
         surface = written.surface_of(robot, mesh)
-        touched, rest = fit.deviations(link, own, surface, count=3000, seed=5)
+        touched, rest = fit.deviations(link, primitives, surface, count=3000, seed=5)
         assert max(touched.gap, touched.excess) <= hand.at_worst.get(mesh, TOLERANCE), mesh
         points = fit.samples(surface, link, 3000, 5)
-        far = np.abs(fit.distance(own, points.pos).min(axis=0)[points.is_touched]) > TOLERANCE
+        far = np.abs(fit.distance(primitives, points.pos).min(axis=0)[points.is_touched]) > TOLERANCE
         assert not link.touched or far.mean() <= (0.01 if mesh in hand.at_worst else 0.0), mesh
         assert touched.mean <= 0.35e-3, mesh
         assert max(rest.gap, rest.excess) <= ELSEWHERE, mesh
-        assert any(collider.is_core for collider in own), mesh
+        assert any(collider.is_core for collider in primitives), mesh
 
 
 @pytest.mark.slow
 def test_every_taxel_of_the_finest_layout_is_near_a_primitive(hand, colliders):
-    """Taxels are on the mesh: the distance of a taxel from its link's primitives is that of the surface."""
+    """Taxels lie on the mesh, so their distances to the primitives are those of the surface."""
     layout = compile_document(ROOT / "examples" / hand.example, {"resolution": "high"}).plan.layout
     for i, link in enumerate(layout.links):
         primitives = [collider for collider in colliders if collider.body == link.body]
-        apart = np.abs(fit.distance(primitives, layout.pos[layout.link_id == i]).min(axis=0))
-        assert apart.max() <= 1.1 * TOLERANCE, link
+        distances = np.abs(fit.distance(primitives, layout.pos[layout.link_id == i]).min(axis=0))
+        assert distances.max() <= 1.1 * TOLERANCE, link
 
 
 def test_every_link_that_collides_has_colliders(robot, colliders):
-    assert {own.body for own in colliders} == {geom.body for geom in robot.geoms if geom.is_colliding}
+    assert {collider.body for collider in colliders} == {geom.body for geom in robot.geoms if geom.is_colliding}
 
 
-def test_no_mesh_collides_and_bodies_weigh_what_they_did(hand, robot, colliders):
+def test_no_mesh_collides_and_masses_stay(hand, robot, colliders):
     model = with_colliders(robot.spec.copy(), colliders).compile()
     is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
     assert is_mesh.sum() == hand.num_meshes and not (model.geom_contype[is_mesh] | model.geom_conaffinity[is_mesh]).any()
     for name in ("body_mass", "body_inertia", "body_ipos", "body_iquat", "jnt_range", "exclude_signature"):
         np.testing.assert_array_equal(getattr(model, name), getattr(robot.compiled, name))
-    assert len(model.mesh_graph) == 0  # no hull is made that nobody needs
+    assert len(model.mesh_graph) == 0  # no unused hull is computed
 
 
 def test_the_left_hands_are_the_mirror_images(hand, colliders):
-    """The mirror image of a point is as far from the left hand's primitives as the point is from the right hand's."""
+    """Mirrored points have the same distances to the left hand's primitives."""
     left, mirror = load_colliders(hand.folder / "colliders_left.yaml"), written.Mirror()
-    assert [mirror.renamed(own.body) for own in colliders] == [own.body for own in left]
+    assert [mirror.renamed(collider.body) for collider in colliders] == [collider.body for collider in left]
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (200, 3))
     np.testing.assert_allclose(fit.distance(left, points * mirror.polar), fit.distance(colliders, points), atol=2e-6)
 
 
-def test_a_link_is_fitted_again_to_the_same_numbers(hand, robot, colliders):
-    body, own = of_mesh(robot, colliders, hand.quick)
-    again = fit.fitted(hand.links[hand.quick], written.surface_of(robot, hand.quick))
-    assert written.text({body: again}, hand.name) == written.text({body: own}, hand.name)
+def test_fitting_a_link_is_repeatable(hand, robot, colliders):
+    body, committed = of_mesh(robot, colliders, hand.quick)
+    refitted = fit.fitted(hand.links[hand.quick], written.surface_of(robot, hand.quick))
+    assert written.text({body: refitted}, hand.name) == written.text({body: committed}, hand.name)
 
 
 @pytest.mark.slow

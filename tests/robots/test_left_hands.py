@@ -1,4 +1,4 @@
-"""The left hands that the robots folder brings are mirror images of the right ones."""
+"""The included left hands are mirror images of the right ones."""
 
 import mujoco
 import numpy as np
@@ -35,7 +35,7 @@ def hands(robot):
     return [mujoco.MjModel.from_xml_path(str(ROBOTS / robot / f"{robot}_{side}.xml")) for side in ("right", "left")]
 
 
-def test_the_files_are_what_the_script_writes(robot):
+def test_the_files_match_the_scripts_output(robot):
     folder = ROBOTS / robot
     outputs, notes = mirror.mirrored_files(folder / f"{robot}_right.xml", folder / "layout.yaml", reflection.Mirror())
     assert notes == []
@@ -51,12 +51,12 @@ def test_the_files_are_what_the_script_writes(robot):
 def test_the_left_hand_is_the_mirror_image(hands):
     rng = np.random.default_rng(0)
     for i in range(10):
-        found = posed(hands, rng)
-        check_frames(("x", "site_x"), *found, 1)
-        check_dynamics(hands, found, 1)
-        np.testing.assert_allclose(found[1].qfrc_bias, found[0].qfrc_bias, atol=EXACT)  # gravity lies in the plane
+        states = posed(hands, rng)
+        check_frames(("x", "site_x"), *states, 1)
+        check_dynamics(hands, states, 1)
+        np.testing.assert_allclose(states[1].qfrc_bias, states[0].qfrc_bias, atol=EXACT)  # gravity lies in the plane
         if i % 5 == 0:
-            check_meshes(hands, found, 1)
+            check_meshes(hands, states, 1)
 
 
 def test_joints_and_drives_are_the_same(hands):
@@ -103,7 +103,7 @@ def test_positive_values_close_the_fingers(robot, hands):
         pytest.param("sharpa", "high", marks=pytest.mark.slow),
     ],
 )
-def test_taxels_of_the_left_hand(robot, resolution):
+def test_taxels_of_the_left_hand_mirror_those_of_the_right(robot, resolution):
     layouts = {}
     for side in ("right", "left"):
         document = {
@@ -114,13 +114,13 @@ def test_taxels_of_the_left_hand(robot, resolution):
             "sensors": {"touch": {"kind": "surface_distance", "links": "hand", "feels": ["base"]}},
         }
         layouts[side] = resolve(load(document)).layout
-    here, there = layouts["right"], layouts["left"]
-    per_link = {link.name: int((there.link_id == i).sum()) for i, link in enumerate(there.links)}
-    counts = {name: sum(per_link[link] for link in links) for name, links in there.groups.items()}
+    right, left = layouts["right"], layouts["left"]
+    per_link = {link.name: int((left.link_id == i).sum()) for i, link in enumerate(left.links)}
+    counts = {name: sum(per_link[link] for link in links) for name, links in left.groups.items()}
     assert counts == HANDS[robot][resolution]
-    assert [link.name for link in there.links] == [link.name.replace("right", "left") for link in here.links]
-    np.testing.assert_array_equal(there.link_id, here.link_id)
-    check_taxels(here, there, 1)
+    assert [link.name for link in left.links] == [link.name.replace("right", "left") for link in right.links]
+    np.testing.assert_array_equal(left.link_id, right.link_id)
+    check_taxels(right, left, 1)
 
 
 def test_a_side_may_have_its_own_layout(tmp_path):

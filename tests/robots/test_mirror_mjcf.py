@@ -81,22 +81,22 @@ MODEL = """<!-- The right arm. -->
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_a_model_with_every_kind_of_frame(tmp_path, axis):
+def test_models_with_every_kind_of_frame_are_mirrored(tmp_path, axis):
     models = both(tmp_path, MODEL, axis)
     rng = np.random.default_rng(axis)
     for _ in range(20):
-        found = posed(models, rng)
-        check_frames(("x", "site_x"), *found, axis)
-        check_frames(("cam_x",), *found, axis, np.diag([-1.0, 1, 1]))
+        states = posed(models, rng)
+        check_frames(("x", "site_x"), *states, axis)
+        check_frames(("cam_x",), *states, axis, np.diag([-1.0, 1, 1]))
         is_mesh = models[0].geom_type == mujoco.mjtGeom.mjGEOM_MESH
         signs = np.array([-1.0 if i == axis else 1.0 for i in range(3)])
-        turns = [data.geom_xmat.reshape(-1, 3, 3)[~is_mesh] for data in found]
+        turns = [data.geom_xmat.reshape(-1, 3, 3)[~is_mesh] for data in states]
         np.testing.assert_allclose(turns[1], signs[:, None] * turns[0] * signs, atol=EXACT)
-        positions = [data.geom_xpos[~is_mesh] for data in found]
+        positions = [data.geom_xpos[~is_mesh] for data in states]
         np.testing.assert_allclose(positions[1], positions[0] * signs, atol=EXACT)
-        check_dynamics(models, found, axis)
-        check_meshes(models, found, axis)
-        np.testing.assert_allclose(found[1].ten_length, found[0].ten_length, atol=EXACT)
+        check_dynamics(models, states, axis)
+        check_meshes(models, states, axis)
+        np.testing.assert_allclose(states[1].ten_length, states[0].ten_length, atol=EXACT)
     right, left = models
     for name in ("jnt_range", "jnt_type", "actuator_gainprm", "actuator_ctrlrange", "key_qpos", "key_ctrl"):
         np.testing.assert_array_equal(getattr(left, name), getattr(right, name), err_msg=name)
@@ -141,7 +141,7 @@ def test_names_change_sides_and_classes_do_not(tmp_path):
         ("</mujoco>", "", "no element found"),
     ],
 )
-def test_what_is_not_known_is_refused_by_name(tmp_path, old, new, message):
+def test_unknown_elements_are_refused_by_name(tmp_path, old, new, message):
     assert MODEL.count(old) >= 1
     (tmp_path / "arm_right.xml").write_text(MODEL.replace(old, new, 1))
     with pytest.raises(reflection.MirrorError, match=r"arm_right\.xml") as caught:
@@ -159,7 +159,7 @@ PEAK = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0], [0, 0, 1], [0, 
 DOUBLE = PEAK[[[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4], [1, 0, 5], [2, 1, 5], [3, 2, 5], [0, 3, 5]]]
 
 
-def test_a_symmetric_mesh_is_shared_and_another_is_written(tmp_path):
+def test_a_symmetric_mesh_is_shared_and_others_are_mirrored(tmp_path):
     (tmp_path / "right_even.stl").write_bytes(stl(DOUBLE))
     (tmp_path / "odd.stl").write_bytes(stl(DOUBLE + [0, 0.01, 0]))
     text = """<mujoco><asset><mesh file="right_even.stl"/><mesh file="odd.stl"/></asset>
@@ -167,8 +167,8 @@ def test_a_symmetric_mesh_is_shared_and_another_is_written(tmp_path):
     models = both(tmp_path, text, 1)
     assert sorted(path.name for path in tmp_path.glob("**/*.stl")) == ["odd.stl", "odd.stl", "right_even.stl"]
     assert [models[1].mesh(i).name for i in range(2)] == ["left_even", "odd"]
-    found = posed(models, np.random.default_rng(0))
-    check_meshes(models, found, 1)
+    states = posed(models, np.random.default_rng(0))
+    check_meshes(models, states, 1)
     written = trimesh.load_mesh(tmp_path / "left" / "odd.stl")
     assert written.volume == pytest.approx(trimesh.load_mesh(tmp_path / "odd.stl").volume) and written.volume > 0
 

@@ -1,4 +1,4 @@
-"""The Sharpa Wave on real input: joints, masses, drives, counts, surfaces, and a cube that a fingertip feels where it is."""
+"""The Sharpa Wave: joints, masses, drives, counts, surfaces, and the depth of a cube on a fingertip."""
 
 import hashlib
 import runpy
@@ -30,7 +30,7 @@ PER_LINK = {
     "high": {"index_elastomer": 47, "middle_elastomer": 46, "ring_elastomer": 46, "pinky_elastomer": 47, "thumb_elastomer": 59}
     | {"MP": 36, "PP": 42, "thumb_PP": 20, "thumb_MC": 30, "pinky_MC": 53, "hand_C_MC": 121},
 }
-"""The same per kind of link; a finger's own figure comes before that of all fingers."""
+"""The same per kind of link; a finger's entry overrides that of all fingers."""
 FINGER = [
     ("MCP_FE", -0.17453, 1.5708, 1.864),
     ("MCP_AA", -0.3491, 0.3491, 1.864),
@@ -91,13 +91,13 @@ def document(tmp_path_factory):
 
 
 def inertia(hand, data):
-    """Return the inertia seen at each joint [kg·m²]."""
+    """Return the inertia at each joint [kg·m²]."""
     matrix = np.zeros((hand.nv, hand.nv))
     mujoco.mj_fullM(hand, data, matrix)
     return np.diag(matrix)
 
 
-def test_joints_and_limits_are_the_hands(hand):
+def test_joints_and_limits_match_the_hand(hand):
     names = [hand.joint(i).name for i in range(hand.njnt)]
     assert names == [f"right_{name}" for name, *_ in JOINTS]
     assert [hand.actuator(i).name for i in range(hand.nu)] == names
@@ -107,14 +107,14 @@ def test_joints_and_limits_are_the_hands(hand):
     np.testing.assert_allclose(hand.actuator_forcerange[:, 1], [effort for *_, effort in JOINTS])
 
 
-def test_masses_are_the_hands(hand):
+def test_masses_match_the_hand(hand):
     for name, mass in MASSES.items():
         assert hand.body(f"right_{name}").mass[0] == pytest.approx(mass, rel=1e-6), name
     assert hand.body_mass.sum() == pytest.approx(1.29969, abs=1e-5)
 
 
 def test_the_straight_fingers_stand_side_by_side(hand):
-    """From the offsets alone: 47 + 31.5 + 26.009 mm from a finger's root to its tip, along the palm's z."""
+    """A finger's tip is 47 + 31.5 + 26.009 mm from its root, along the palm's z."""
     data = mujoco.MjData(hand)
     mujoco.mj_forward(hand, data)
     tips = {name: data.site(f"right_{name}_fingertip").xpos for name in ("index", "middle", "ring", "pinky")}
@@ -149,7 +149,7 @@ def test_drives_reach_their_targets_and_stay(timestep):
 
 
 @pytest.mark.parametrize("timestep", [0.002, 0.005])
-def test_drives_stay_stable_whatever_they_are_told(timestep):
+def test_drives_stay_stable_for_random_targets(timestep):
     hand = mujoco.MjModel.from_xml_path(str(MODEL))
     hand.opt.timestep = timestep
     data = mujoco.MjData(hand)
@@ -172,29 +172,29 @@ def test_drives_hold_against_gravity(down):
     assert np.abs(data.qpos).max() < np.deg2rad(1.5)
 
 
-def test_surfaces_are_closed_and_made_again_byte_for_byte():
+def test_surfaces_are_closed_and_reproducible():
     assets = sorted((FOLDER / "assets").glob("*.stl"))
     assert len(assets) == 13
-    before = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in assets}
+    hashes = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in assets}
     for path in assets:
         mesh = trimesh.load(path, force="mesh")
         assert isinstance(mesh, trimesh.Trimesh)
         assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0, path.name
         assert len(mesh.faces) <= 1200, path.name
     runpy.run_path(str(FOLDER / "make_meshes.py"), run_name="__main__")
-    assert {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in assets} == before
+    assert {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in assets} == hashes
 
 
 @pytest.mark.parametrize("resolution", ["med", *(pytest.param(name, marks=pytest.mark.slow) for name in ("low", "high"))])
-def test_counts_are_the_papers(document, resolution):
+def test_counts_match_the_paper(document, resolution):
     plan = compile_document(document, {"resolution": resolution}).plan
     layout = plan.layout
     per_link = {link.name: int((layout.link_id == i).sum()) for i, link in enumerate(plan.layout.links)}
     assert {group: sum(per_link[name] for name in names) for group, names in plan.layout.groups.items()} == COUNTS[resolution]
-    wanted = PER_LINK[resolution]
+    expected = PER_LINK[resolution]
     for name, count in per_link.items():
         whole = name.removeprefix("right_")
-        assert count == wanted.get(whole, wanted.get(whole.partition("_")[2])), name
+        assert count == expected.get(whole, expected.get(whole.partition("_")[2])), name
     assert len(per_link) == 17
     np.testing.assert_allclose(layout.radius, 3e-3 if resolution == "high" else 4e-3)
     np.testing.assert_allclose(np.linalg.norm(layout.normal, axis=1), 1, atol=1e-12)
@@ -208,8 +208,8 @@ def high(document):
 
 
 @pytest.mark.slow
-def test_taxels_lie_on_the_surfaces_and_near_what_collides(high):
-    """MuJoCo collides convex hulls: they may leave out a little of a pad, and only the palm's hollow is spanned by one."""
+def test_taxels_lie_on_the_surfaces_and_near_the_hulls(high):
+    """Hulls may miss a little of a pad; only the palm's hollow lies inside one."""
     layout, robot = high.layout, load_model(MODEL)
     for i, link in enumerate(layout.links):
         pos = layout.pos[layout.link_id == i]
@@ -231,33 +231,33 @@ def test_taxels_lie_on_the_surfaces_and_near_what_collides(high):
 
 @pytest.mark.slow
 def test_pads_face_away_from_the_bone(high):
-    """In the straight hand all fingers' taxels look out of the palm, as the palm's own do; a thumb's look along its pad."""
+    """In the straight hand, taxels of fingers and palm face out of the palm, the thumb's along its pad."""
     layout, hand = high.layout, mujoco.MjModel.from_xml_path(str(MODEL))
     data = mujoco.MjData(hand)
     mujoco.mj_forward(hand, data)
     thumb = data.body("right_thumb_DP").xmat.reshape(3, 3)[:, 1]
     for i, link in enumerate(layout.links):
-        chosen = layout.link_id == i
-        normal = layout.normal[chosen] @ data.body(link.body).xmat.reshape(3, 3).T
+        on_link = layout.link_id == i
+        normal = layout.normal[on_link] @ data.body(link.body).xmat.reshape(3, 3).T
         outward = thumb if "thumb" in link.name else np.array([1.0, 0.0, 0.0])
         assert (normal @ outward).min() > 0.1, link.name
         assert (normal @ outward).mean() > 0.75, link.name
         if link.name.endswith("elastomer"):
             bone = data.body(link.name.replace("elastomer", "DP"))
             axis, out = bone.xmat.reshape(3, 3)[:, 0], bone.xmat.reshape(3, 3)[:, 1]
-            pos = data.body(link.body).xpos + layout.pos[chosen] @ data.body(link.body).xmat.reshape(3, 3).T
+            pos = data.body(link.body).xpos + layout.pos[on_link] @ data.body(link.body).xmat.reshape(3, 3).T
             assert ((pos - bone.xpos) @ axis).min() > 0.008, link.name
             assert ((pos - bone.xpos) @ out).mean() > 0.001, link.name
 
 
 @pytest.mark.slow
-def test_a_cube_pressed_on_a_tip_is_felt_where_it_is(document):
-    """Depth is radius minus distance to the cube for every taxel whose link touches it, from poses and a box alone."""
+def test_depths_of_a_pressed_cube_match_its_pose(document):
+    """Depth is radius minus distance to the box, for every taxel of a touching link."""
     touch = tgdsl.compile(document, dtype=torch.float64)
     sim = tgdsl.simulate(touch, num_envs=1, substeps=5)
     push = np.zeros((1, sim.model.nu))
     push[0, sim.model.actuator("push").id] = 1.0
-    before = touch(sim.state())["depth"]
+    rest_depth = touch(sim.state())["depth"]
     for _ in range(60):
         sim.step(push)
     state = sim.state()
@@ -266,11 +266,11 @@ def test_a_cube_pressed_on_a_tip_is_felt_where_it_is(document):
     pos, turn = state.body_pos[0].numpy(), Rotation.from_quat(state.body_quat[0].numpy(), scalar_first=True)
     table = touch.taxels["depth"]
     body = [rows[name] for name in table["body"]]
-    places = turn[rows["cube"]].inv().apply(pos[body] + turn[body].apply(table["pos"]) - pos[rows["cube"]])
-    beyond = np.abs(places) - 0.008
+    positions = turn[rows["cube"]].inv().apply(pos[body] + turn[body].apply(table["pos"]) - pos[rows["cube"]])
+    beyond = np.abs(positions) - 0.008
     distance = np.where((beyond > 0).any(axis=1), np.linalg.norm(np.maximum(beyond, 0), axis=1), beyond.max(axis=1))
     np.testing.assert_allclose(depth, np.maximum(table["radius"] - distance, 0), atol=1e-14)
     assert set(table["link"][depth > 0]) == {"right_index_elastomer"}
     assert (depth > 0).sum() >= 3
     assert depth.max() == pytest.approx(4e-3, abs=0.5e-3)
-    assert before.max() < depth.max()
+    assert rest_depth.max() < depth.max()

@@ -1,4 +1,4 @@
-"""STL files that are text, which MuJoCo does not read: the same surface as in binary, in MJCF, in URDF and in an artefact."""
+"""Text STL files, which MuJoCo does not read, give the binary file's surface in MJCF, URDF and artefacts."""
 
 from pathlib import Path
 
@@ -34,13 +34,13 @@ def written(folder: Path, name: str, text: str, is_text: bool) -> Path:
 
 
 @pytest.mark.parametrize(("name", "text"), [("r.xml", BODY), ("r.urdf", URDF)], ids=["mjcf", "urdf"])
-def test_a_text_file_is_the_same_surface(tmp_path, name, text):
+def test_a_text_file_gives_the_same_surface(tmp_path, name, text):
     models = [load_model(written(tmp_path / str(is_text), name, text, is_text)).compiled for is_text in (True, False)]
     np.testing.assert_array_equal(models[0].mesh_vert, models[1].mesh_vert)
     np.testing.assert_array_equal(models[0].mesh_face, models[1].mesh_face)
 
 
-def test_files_of_one_name_are_told_apart(tmp_path):
+def test_files_with_one_name_stay_separate(tmp_path):
     for folder, content in (
         ("a", trimesh.exchange.stl.export_stl_ascii(BLOCK)),
         ("b", trimesh.exchange.stl.export_stl_ascii(BALL)),
@@ -57,7 +57,7 @@ def test_files_of_one_name_are_told_apart(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "text", "feels"), [("r.xml", BODY, "ball"), ("r.urdf", URDF, "base")], ids=["mjcf", "urdf"])
-def test_an_artefact_finds_its_text_file_again(tmp_path, name, text, feels):
+def test_an_artefact_reads_its_text_file(tmp_path, name, text, feels):
     model = written(tmp_path / "robot", name, text, True)
     top = {"method": "grid", "rows": 2, "columns": 2, "direction": [0, 0, -1], "radius": "4 mm"}
     (tmp_path / "layout.yaml").write_text(f"tgdsl: 1\ngroups: {{}}\nresolutions: {{low: {{hand: {top}}}}}")
@@ -73,12 +73,12 @@ def test_an_artefact_finds_its_text_file_again(tmp_path, name, text, feels):
     assert touch(tgdsl.simulate(touch, 1).state())["depth"].shape == (1, 4, 1)
 
 
-def test_what_is_no_text_is_left_alone():
+def test_other_files_are_left_alone():
     binary = trimesh.exchange.stl.export_stl(BLOCK)
-    lying = b"solid facet" + binary[11:]
+    misleading = b"solid facet" + binary[11:]
     for name, content in (
         ("a.stl", binary),
-        ("a.stl", lying),
+        ("a.stl", misleading),
         ("a.obj", b"solid facet"),
         ("a.stl", b"solid facet vertex 1 2 x"),
     ):

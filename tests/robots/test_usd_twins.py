@@ -1,6 +1,6 @@
-"""Robots in USD feel as their MJCF twins do: the same layouts, and the same readings through a squeeze.
+"""Robots in USD feel like their MJCF twins: the same layouts, and the same readings during a squeeze.
 
-What the two models differ by is the order of floating-point operations: 1e-16, which contacts make 1e-12 of within a second.
+The models differ by the order of floating-point operations: 1e-16, which contacts amplify to 1e-12 within a second.
 """
 
 import runpy
@@ -37,11 +37,11 @@ SHARPA_SCENE = f"""
 </mujoco>
 """
 FULL_SCALE = 1e-6
-"""Largest difference of a reading, of the largest of the run. Joint frames in float32 alone would make 1.5e-6."""
+"""Largest difference of a reading relative to the run's maximum. Float32 joint frames alone would give 1.5e-6."""
 STEPS, HOLD, RAMP = 150, 10, 120
-"""Control steps of 2 ms in all, before the squeeze, and from its start to its end."""
+"""Control steps of 2 ms: in all, before the squeeze, and during it."""
 
-# Scenes hold keyframes, lights and the like, which USD does not: the exporter says so.
+# The exporter warns of keyframes, lights and other things that USD does not hold.
 pytestmark = pytest.mark.filterwarnings("ignore:.*USD holds no")
 
 
@@ -59,7 +59,7 @@ def document(model: Path, hand: str, resolution: str, obj: str) -> dict:
 
 
 def scene(hand: str, folder: Path) -> tuple[Path, np.ndarray, np.ndarray, np.ndarray]:
-    """Return a scene with a hand and a free cube, its first positions, and the controls that hold and that squeeze."""
+    """Return a scene with a hand and a free cube, its initial positions, and controls that hold and squeeze."""
     if hand == "xhand1":
         file = ROOT / "examples" / "palm_cube.xml"
         model = load_model(file).compiled
@@ -68,13 +68,13 @@ def scene(hand: str, folder: Path) -> tuple[Path, np.ndarray, np.ndarray, np.nda
     file = folder / "sharpa_cube.xml"
     file.write_text(SHARPA_SCENE)
     model = load_model(file).compiled
-    wanted = {"MCP_FE": 1.3, "PIP": 1.2, "DIP": 0.6, "CMC_FE": 1.5, "IP": 0.5}
-    squeeze = np.array([wanted.get(model.actuator(i).name.split("_", 2)[2], 0.0) for i in range(model.nu)])
+    targets = {"MCP_FE": 1.3, "PIP": 1.2, "DIP": 0.6, "CMC_FE": 1.5, "IP": 0.5}
+    squeeze = np.array([targets.get(model.actuator(i).name.split("_", 2)[2], 0.0) for i in range(model.nu)])
     return file, model.qpos0, np.zeros(model.nu), squeeze
 
 
 def run(file: Path, hand: str, qpos: np.ndarray, hold: np.ndarray, squeeze: np.ndarray) -> dict[str, np.ndarray]:
-    """Return positions, and depth, force and torque of all taxels, after each step; one hand closes, the other half as far."""
+    """Return positions, depths, forces and torques after each step; one hand closes, the other half as far."""
     touch = tgdsl.compile(document(file, hand, "med", "cube"), dtype=torch.float64)
     sim = tgdsl.simulate(touch, 2)
     sim.batch.qpos[...] = qpos
@@ -90,12 +90,12 @@ def run(file: Path, hand: str, qpos: np.ndarray, hold: np.ndarray, squeeze: np.n
     return {name: np.stack(values) for name, values in steps.items()}
 
 
-def test_twins_are_made_again_byte_for_byte():
+def test_twins_are_reproducible():
     files = [file.with_suffix(".usda") for file in sorted((ROOT / "robots").glob("*/*.xml"))]
-    before = [file.read_bytes() for file in files]
+    contents = [file.read_bytes() for file in files]
     runpy.run_path(str(ROOT / "robots" / "make_usd.py"), run_name="__main__")
-    assert [file.read_bytes() for file in files] == before
-    assert max(map(len, before)) < 3_000_000
+    assert [file.read_bytes() for file in files] == contents
+    assert max(map(len, contents)) < 3_000_000
 
 
 ROBOTS = sorted((ROOT / "robots").glob("*/*.xml"))
@@ -132,7 +132,7 @@ def colliding_pairs(model) -> set[tuple[int, int]]:
 
 @pytest.mark.parametrize(("hand", "resolution"), [("xhand1", "low"), pytest.param("sharpa", "high", marks=pytest.mark.slow)])
 def test_layouts_are_the_same(hand, resolution):
-    """The palm is what is felt: any object would do."""
+    """The palm is the felt object; any would do."""
     files = [ROOT / "robots" / hand / f"{hand}_right{ending}" for ending in (".xml", ".usda")]
     first, second = (resolve(load(document(file, hand, resolution, HANDS[hand]), None, KINDS)).layout for file in files)
     assert set(first.groups) == {"tips", "palm", "fingers", "hand"}
@@ -151,15 +151,17 @@ def test_a_squeeze_reads_the_same(hand, tmp_path):
     file, qpos, hold, squeeze = scene(hand, tmp_path)
     export_model(file, tmp_path / "scene.usda")
     first, second = (run(model, hand, qpos, hold, squeeze) for model in (file, tmp_path / "scene.usda"))
-    assert (first["depth"][-1] > 0).any(axis=-1).all()  # the cube is felt to the end, in both environments
+    assert (first["depth"][-1] > 0).any(axis=-1).all()  # both environments feel the cube to the end
     for name, values in first.items():
         off = np.abs(second[name] - values).max() / np.abs(values).max()
         assert off < FULL_SCALE, f"{name} differs by {off:.1e} of {np.abs(values).max():.3g}"
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*collides the convex hull", "ignore::tgdsl.errors.UnfeltWarning")  # its own palm is felt
-def test_an_artefact_of_a_usd_robot_is_kept_and_run(tmp_path):
+@pytest.mark.filterwarnings(
+    "ignore:.*collides the convex hull", "ignore::tgdsl.errors.UnfeltWarning"
+)  # the hand's palm is the felt object
+def test_a_loaded_artefact_of_a_usd_robot_reads_the_same(tmp_path):
     model = ROOT / "robots" / "xhand1" / "xhand1_right.usda"
     touch = tgdsl.compile(document(model, "xhand1", "low", HANDS["xhand1"]))
     tgdsl.save(touch, tmp_path / "touch.safetensors")

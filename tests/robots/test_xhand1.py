@@ -1,4 +1,4 @@
-"""The XHand1 on real input: counts, surfaces, and a cube that is felt where it is."""
+"""The XHand1: counts, surfaces, and depths of a squeezed cube."""
 
 import hashlib
 import runpy
@@ -36,7 +36,7 @@ def hand():
     return mujoco.MjModel.from_xml_path(str(ROOT / "robots" / "xhand1" / "xhand1_right.xml"))
 
 
-def test_joints_limits_and_masses_are_the_hands(hand):
+def test_joints_limits_and_masses_match_the_hand(hand):
     names = [hand.joint(i).name for i in range(hand.njnt)]
     assert names == [f"right_hand_{name}" for name, _, _ in JOINTS]
     assert [hand.actuator(i).name for i in range(hand.nu)] == names
@@ -46,20 +46,20 @@ def test_joints_limits_and_masses_are_the_hands(hand):
     assert hand.body_mass.sum() == pytest.approx(1.1015, abs=1e-3)
 
 
-def test_surfaces_are_closed_and_made_again_byte_for_byte(tmp_path):
+def test_surfaces_are_closed_and_reproducible(tmp_path):
     assets = sorted((ROOT / "robots" / "xhand1" / "assets").glob("*.stl"))
     assert len(assets) == 7
-    before = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in assets}
+    hashes = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in assets}
     for path in assets:
         mesh = trimesh.load(path, force="mesh")
         assert isinstance(mesh, trimesh.Trimesh)
         assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0, path.name
     runpy.run_path(str(ROOT / "robots" / "xhand1" / "make_meshes.py"), run_name="__main__")
-    assert {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in assets} == before
+    assert {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in assets} == hashes
 
 
 @pytest.mark.parametrize("resolution", ["med", pytest.param("high", marks=pytest.mark.slow)])
-def test_counts_are_the_papers(resolution):
+def test_counts_match_the_paper(resolution):
     plan = compile_document(EXAMPLE, {"resolution": resolution}).plan
     layout = plan.layout
     per_link = {link.name: int((layout.link_id == i).sum()) for i, link in enumerate(plan.layout.links)}
@@ -70,7 +70,7 @@ def test_counts_are_the_papers(resolution):
 
 @pytest.fixture(scope="module")
 def squeezed():
-    """Return module, simulation and readings after resting and after squeezing, of two environments."""
+    """Return the module and its readings of two environments, after resting and after squeezing."""
     touch = tgdsl.compile(EXAMPLE, dtype=torch.float64)
     sim = tgdsl.simulate(touch, num_envs=2, substeps=5, keyframe="rest")
     controls = scripted_controls(sim.model, ("rest", "squeeze"), 1.0, sim.control_step)
@@ -84,7 +84,7 @@ def squeezed():
 
 
 def in_cube(touch, state):
-    """Return the taxels of environment 0 in the cube's frame [m], from the state's poses alone."""
+    """Return the taxels of environment 0 in the cube's frame [m], from the state's poses."""
     rows = {name: i for i, name in enumerate(touch.inputs.bodies)}
     pos = state.body_pos[0].numpy()
     turn = Rotation.from_quat(state.body_quat[0].numpy(), scalar_first=True)
@@ -96,12 +96,12 @@ def in_cube(touch, state):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("moment", ["rest", "squeeze"])
-def test_what_is_felt_is_where_the_cube_is(squeezed, moment):
-    """Depth is radius minus distance to the cube for every taxel whose link touches it, from poses and a box alone."""
+def test_depths_match_the_pose_of_the_cube(squeezed, moment):
+    """Depth is radius minus distance to the box, for every taxel of a touching link."""
     touch, readings = squeezed
-    reading, places = readings[moment]
+    reading, positions = readings[moment]
     depth = reading["depth"][0, :, 0].numpy()
-    beyond = np.abs(places) - 0.02
+    beyond = np.abs(positions) - 0.02
     distance = np.where((beyond > 0).any(axis=1), np.linalg.norm(np.maximum(beyond, 0), axis=1), beyond.max(axis=1))
     expected = np.maximum(touch.taxels["depth"]["radius"] - distance, 0)
     is_felt = depth > 0
@@ -123,7 +123,7 @@ def test_squeezing_is_felt_more_than_resting(squeezed):
 
 
 @pytest.mark.slow
-def test_environments_that_start_alike_stay_alike(squeezed):
+def test_equal_environments_stay_equal(squeezed):
     for reading, *_ in squeezed[1].values():
         for value in reading.values():
             torch.testing.assert_close(value[0], value[1], rtol=0, atol=0)

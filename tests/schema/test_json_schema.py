@@ -1,4 +1,4 @@
-"""The JSON Schema says what the loader says, by a small validator of the keywords that it uses."""
+"""The JSON Schema agrees with the loader, by a small validator of the keywords that it uses."""
 
 import json
 import re
@@ -26,91 +26,91 @@ def accepts(schema: dict[str, Any], value: Any) -> bool:
 
 
 def holds(key: str, schema: dict[str, Any], value: Any) -> bool:
-    """Whether one keyword of draft 2020-12 holds; a keyword that is not known here is an error."""
-    wanted = schema[key]
+    """Return whether one keyword of draft 2020-12 holds; unknown keywords raise an error."""
+    expected = schema[key]
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     match key:
         case "$ref":
-            return accepts(SCHEMA["$defs"][wanted.removeprefix("#/$defs/")], value)
+            return accepts(SCHEMA["$defs"][expected.removeprefix("#/$defs/")], value)
         case "type":
-            return isinstance(value, TYPES[wanted]) and (wanted == "boolean" or not isinstance(value, bool))
+            return isinstance(value, TYPES[expected]) and (expected == "boolean" or not isinstance(value, bool))
         case "const":
-            return value == wanted
+            return value == expected
         case "enum":
-            return value in wanted
+            return value in expected
         case "anyOf":
-            return any(accepts(part, value) for part in wanted)
+            return any(accepts(part, value) for part in expected)
         case "oneOf":
-            return sum(accepts(part, value) for part in wanted) == 1
+            return sum(accepts(part, value) for part in expected) == 1
         case "if":
-            return accepts(schema["then" if accepts(wanted, value) else "else"], value)
+            return accepts(schema["then" if accepts(expected, value) else "else"], value)
         case "required":
-            return not isinstance(value, dict) or set(wanted) <= set(value)
+            return not isinstance(value, dict) or set(expected) <= set(value)
         case "minProperties":
-            return not isinstance(value, dict) or len(value) >= wanted
+            return not isinstance(value, dict) or len(value) >= expected
         case "properties":
-            return not isinstance(value, dict) or all(accepts(wanted[k], v) for k, v in value.items() if k in wanted)
+            return not isinstance(value, dict) or all(accepts(expected[k], v) for k, v in value.items() if k in expected)
         case "patternProperties":
             return not isinstance(value, dict) or all(
-                accepts(part, v) for pattern, part in wanted.items() for k, v in value.items() if re.search(pattern, k)
+                accepts(part, v) for pattern, part in expected.items() for k, v in value.items() if re.search(pattern, k)
             )
         case "additionalProperties":
             if not isinstance(value, dict):
                 return True
             others = [v for k, v in value.items() if k not in schema.get("properties", {})]
-            return not others if wanted is False else all(accepts(wanted, v) for v in others)
+            return not others if expected is False else all(accepts(expected, v) for v in others)
         case "prefixItems":
-            return not isinstance(value, list) or all(map(accepts, wanted, value))
+            return not isinstance(value, list) or all(map(accepts, expected, value))
         case "items":
-            return not isinstance(value, list) or all(accepts(wanted, part) for part in value)
+            return not isinstance(value, list) or all(accepts(expected, part) for part in value)
         case "minItems":
-            return not isinstance(value, list) or len(value) >= wanted
+            return not isinstance(value, list) or len(value) >= expected
         case "maxItems":
-            return not isinstance(value, list) or len(value) <= wanted
+            return not isinstance(value, list) or len(value) <= expected
         case "pattern":
-            return not isinstance(value, str) or re.search(wanted, value) is not None
+            return not isinstance(value, str) or re.search(expected, value) is not None
         case "minimum":
-            return not is_number or value >= wanted
+            return not is_number or value >= expected
         case "maximum":
-            return not is_number or value <= wanted
+            return not is_number or value <= expected
         case "exclusiveMinimum":
-            return not is_number or value > wanted
+            return not is_number or value > expected
     raise NotImplementedError(key)
 
 
-def places(schema: dict[str, Any], value: Any, path: yaml.Path = ()) -> set[str]:
-    """Return where an editor shows mistakes: an alternative of `anyOf` or `oneOf` that does not fit says no more than that."""
-    found: set[str] = set()
+def mistake_paths(schema: dict[str, Any], value: Any, path: yaml.Path = ()) -> set[str]:
+    """Return where an editor shows mistakes: for `anyOf` and `oneOf`, only the value itself."""
+    paths: set[str] = set()
     for key in schema:
-        wanted = schema[key]
+        expected = schema[key]
         if key in ANNOTATIONS or holds(key, schema, value):
             continue
         if key == "$ref":
-            found |= places(SCHEMA["$defs"][wanted.removeprefix("#/$defs/")], value, path)
+            paths |= mistake_paths(SCHEMA["$defs"][expected.removeprefix("#/$defs/")], value, path)
         elif key == "if":
-            found |= places(schema["then" if accepts(wanted, value) else "else"], value, path)
+            paths |= mistake_paths(schema["then" if accepts(expected, value) else "else"], value, path)
         elif key == "properties":
-            found |= {place for k, v in value.items() if k in wanted for place in places(wanted[k], v, (*path, k))}
-        elif key in ("patternProperties", "additionalProperties") and wanted is not False:
-            known = schema.get("properties", {})
-            part = wanted if key == "additionalProperties" else next(iter(wanted.values()))
-            found |= {place for k, v in value.items() if k not in known for place in places(part, v, (*path, k))}
+            paths |= {place for k, v in value.items() if k in expected for place in mistake_paths(expected[k], v, (*path, k))}
+        elif key in ("patternProperties", "additionalProperties") and expected is not False:
+            properties = schema.get("properties", {})
+            part = expected if key == "additionalProperties" else next(iter(expected.values()))
+            paths |= {place for k, v in value.items() if k not in properties for place in mistake_paths(part, v, (*path, k))}
         elif key == "additionalProperties":
-            found |= {yaml.path_text((*path, k)) for k in value if k not in schema.get("properties", {})}
+            paths |= {yaml.path_text((*path, k)) for k in value if k not in schema.get("properties", {})}
         elif key in ("items", "prefixItems"):
-            parts = [wanted] * len(value) if key == "items" else wanted
+            parts = [expected] * len(value) if key == "items" else expected
             pairs = zip(parts, value, strict=False)
-            found |= {place for i, (part, v) in enumerate(pairs) for place in places(part, v, (*path, i))}
+            paths |= {place for i, (part, v) in enumerate(pairs) for place in mistake_paths(part, v, (*path, i))}
         else:
-            found.add(yaml.path_text(path))
-    return found
+            paths.add(yaml.path_text(path))
+    return paths
 
 
 def plain(text: str) -> Any:
     return yaml.parse(text, "f").value
 
 
-def test_it_is_plain_json_whose_references_lead_somewhere():
+def test_the_schema_is_json_with_resolvable_references():
     text = json.dumps(SCHEMA)
     assert json.loads(text) == SCHEMA
     assert set(re.findall(r'"\$ref": "#/\$defs/(\w+)"', text)) <= set(SCHEMA["$defs"])
@@ -149,16 +149,16 @@ BEYOND_A_SCHEMA = {
     "unknown profile to start from",
     "range the wrong way round",
 }
-"""Mistakes that only the loader finds: between keys, of names and files, and those of YAML itself."""
+"""Mistakes that only the loader finds: between keys, of names and files, and in the YAML itself."""
 
 
 @pytest.mark.parametrize("name", sorted(set(WRONG) - {"empty", "tab", "null"}))
-def test_wrong_documents_are_refused_where_a_schema_can(name):
+def test_wrong_documents_are_refused_if_a_schema_can(name):
     assert accepts(SCHEMA, plain(WRONG[name][0])) == (name in BEYOND_A_SCHEMA)
 
 
 @pytest.mark.parametrize("name", sorted(WRONG_LAYOUT))
-def test_wrong_layouts_are_refused_where_a_schema_can(name):
+def test_wrong_layouts_are_refused_if_a_schema_can(name):
     layout = {"tgdsl": 1} | plain(LAYOUT.replace(POISSON, f"{POISSON[:-1]}, {WRONG_LAYOUT[name][0]}}}", 1))
     assert accepts(SCHEMA, layout) == (name in ("unordered box", "two of which one is wanted"))
 
@@ -174,30 +174,30 @@ IN_A_SENSOR = {
 
 
 def test_a_mistake_is_shown_where_the_loader_finds_it():
-    """In sensors, in all alternatives of all of them: none is put down to the whole sensor."""
+    """In all alternatives of sensors, the path is never just the sensor."""
     document = valid() | {"sensors": IN_A_SENSOR, "observations": {"policy": [{"type": "force", "fo": "x", "of": "touch"}]}}
     document["objects"] = {"ball": {"geom": {"type": "box", "size": ["4 N"]}}, "cup": {"variants": [{"mesh": "a", "scl": 1}]}}
     document["robot"]["layout"]["resolutions"]["low"]["a"] |= {"rows": 0, "region": [{"facing": [0, 0, "x"], "within": 1}]}
     with pytest.raises(SpecError) as caught:
         load(document).raise_problems()
-    wanted = {problem.path for problem in caught.value.problems}
-    assert places(SCHEMA, document) == wanted
-    assert len(wanted) == 17 and not wanted & {f"sensors.{name}" for name in IN_A_SENSOR}
+    expected = {problem.path for problem in caught.value.problems}
+    assert mistake_paths(SCHEMA, document) == expected
+    assert len(expected) == 17 and not expected & {f"sensors.{name}" for name in IN_A_SENSOR}
 
 
-def test_nothing_is_left_to_a_choice_between_mappings():
-    """What `anyOf` still decides, beside alternatives that none of the keys tells apart, is between plain values."""
+def test_anyof_never_chooses_between_mappings():
+    """`anyOf` chooses between plain values, or between mappings only if no key distinguishes them."""
 
     def choices(schema: Any, inside: str) -> set[str]:
         if isinstance(schema, list):
-            return {found for part in schema for found in choices(part, inside)}
+            return {choices_here for part in schema for choices_here in choices(part, inside)}
         if not isinstance(schema, dict):
             return set()
-        own = schema.get("anyOf", []) + schema.get("oneOf", [])
-        mappings = [part for part in own if "$ref" in part or "object" in part.get("type", "")]
-        is_last = inside == "else" and len(mappings) == len(own)  # where no key was found: any of them
-        found = {json.dumps(schema)} if mappings and not is_last else set()
-        return found | {found for key, part in schema.items() for found in choices(part, key)}
+        alternatives = schema.get("anyOf", []) + schema.get("oneOf", [])
+        mappings = [part for part in alternatives if "$ref" in part or "object" in part.get("type", "")]
+        is_last = inside == "else" and len(mappings) == len(alternatives)  # where no key was found: any of them
+        choices_here = {json.dumps(schema)} if mappings and not is_last else set()
+        return choices_here | {choices_here for key, part in schema.items() for choices_here in choices(part, key)}
 
     assert choices(SCHEMA, "") == set()
 
@@ -212,11 +212,11 @@ def test_patterns_of_units_agree_with_the_loader(tmp_path: Path, text):
     assert pos in layout
     try:
         read(tmp_path, layout=layout)
-        is_good = True
+        is_valid = True
     except SpecError:
-        is_good = False
-    assert accepts(SCHEMA, {"tgdsl": 1} | plain(layout)) == is_good
-    assert is_good == (text in QUANTITIES[:6] + QUANTITIES[-1:])
+        is_valid = False
+    assert accepts(SCHEMA, {"tgdsl": 1} | plain(layout)) == is_valid
+    assert is_valid == (text in QUANTITIES[:6] + QUANTITIES[-1:])
 
 
 def test_every_key_is_described():
@@ -234,7 +234,7 @@ def test_unknown_keys_are_refused_everywhere():
     assert [name for name, part in SCHEMA["$defs"].items() if part.get("additionalProperties") is not False] == []
 
 
-def test_all_kinds_are_there():
+def test_the_schema_has_all_kinds():
     sensors = SCHEMA["$defs"]["Document"]["properties"]["sensors"]
     (sensor,) = sensors["patternProperties"].values()
     assert set(sensor["discriminator"]["mapping"]) == {kind.name for kind in KINDS}

@@ -1,4 +1,4 @@
-"""Every mistake of a document is found in one run, stands at its place, and says what would be right."""
+"""All mistakes of a document are found at once, located, and come with a hint."""
 
 import pytest
 from documents import DOCUMENT, LAYOUT, POISSON, mistakes, read, write
@@ -8,7 +8,7 @@ from tgdsl.errors import SpecError, did_you_mean, listed
 from tgdsl.schema.load import load, load_layout
 
 
-def test_a_good_document(tmp_path):
+def test_a_valid_document_is_loaded(tmp_path):
     loaded = read(tmp_path, DOCUMENT + "    threshold: 1 mm\nobservations:\n  policy: [{type: bool, of: touch/clean}]\n")
     assert loaded.resolution == "low"
     assert loaded.spec.sensors["touch"].threshold == 1e-3
@@ -18,7 +18,7 @@ def test_a_good_document(tmp_path):
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_a_mistake_and_nothing_else(tmp_path, name):
+def test_each_mistake_gives_one_message(tmp_path, name):
     document, message = WRONG[name]
     assert mistakes(tmp_path, document) == [message]
 
@@ -30,7 +30,7 @@ def test_mistakes_of_a_layout_name_its_file(tmp_path, name):
     assert mistakes(tmp_path, layout=layout) == [message]
 
 
-def test_points_named_as_their_method(tmp_path):
+def test_mistakes_in_points_name_their_field(tmp_path):
     points = "{method: points, points: [{pos: [0, 0, 0], normal: [0, 0, 1]}], radius: x}"
     assert mistakes(tmp_path, layout=LAYOUT.replace(POISSON, points)) == [
         'layout.yaml:5:88: resolutions.low.index_tip.radius: "x" is not a quantity, '
@@ -42,7 +42,7 @@ def test_points_named_as_their_method(tmp_path):
     ]
 
 
-def test_a_layout_that_is_no_yaml(tmp_path):
+def test_invalid_yaml_of_a_layout_is_reported(tmp_path):
     assert mistakes(tmp_path, layout="a: [\n") == [
         "layout.yaml:2:1: not YAML: expected the node content, but found '<stream end>'"
     ]
@@ -50,7 +50,7 @@ def test_a_layout_that_is_no_yaml(tmp_path):
     assert mistakes(tmp_path, layout="groups: {}\n") == ['layout.yaml:1:1: missing key "resolutions"']
 
 
-def test_a_layout_with_mistakes_of_its_yaml_alone_is_refused(tmp_path):
+def test_a_layout_with_a_repeated_key_is_refused(tmp_path):
     (tmp_path / "layout.yaml").write_text(LAYOUT)
     assert set(load_layout(tmp_path / "layout.yaml").spec.resolutions) == {"low", "high"}
     (tmp_path / "layout.yaml").write_text(f"{LAYOUT}resolutions: {{}}\n")
@@ -58,7 +58,7 @@ def test_a_layout_with_mistakes_of_its_yaml_alone_is_refused(tmp_path):
         load_layout(tmp_path / "layout.yaml")
 
 
-def test_files_that_cannot_be_read(tmp_path):
+def test_unreadable_files_are_reported(tmp_path):
     with pytest.raises(SpecError) as caught:
         load(tmp_path / "no.yaml")
     assert str(caught.value) == f"{tmp_path}/no.yaml: cannot read this file: No such file or directory"
@@ -87,7 +87,7 @@ resolution: middle
 """
 
 
-def test_many_mistakes_are_sorted_each_once_and_cause_no_others(tmp_path):
+def test_many_mistakes_are_sorted_and_cause_no_others(tmp_path):
     assert mistakes(tmp_path, MANY, LAYOUT.replace("2 mm", "2 mn", 1)) == [
         'hand.yaml:2:45: robot.colour: unknown key "colour"; known keys: collision, layout, model',
         'hand.yaml:4:10: objects.ball.bodi: unknown key "bodi"; did you mean "body"?',
@@ -102,12 +102,12 @@ def test_many_mistakes_are_sorted_each_once_and_cause_no_others(tmp_path):
 
 
 @pytest.mark.parametrize("found", ["3", "[{body: ball}]", "", "ball"])
-def test_a_part_of_another_type_causes_no_unknown_names(tmp_path, found):
+def test_a_part_of_a_wrong_type_causes_no_unknown_names(tmp_path, found):
     shown = {"3": "3", "": "nothing", "ball": '"ball"'}.get(found, "a list of 1")
     document = DOCUMENT.replace("objects:\n  ball: {body: ball}\n  cube: {body: cube}\n", f"objects: {found}\n")
     document += f"    noise: mine\nnoise: {found}\nobservations: {found}\n"
-    wrong = [text.split(": ", 1)[1] for text in mistakes(tmp_path, document)]
-    assert wrong == [f"{key}: found {shown}, expected a mapping" for key in ("objects", "noise", "observations")]
+    messages = [text.split(": ", 1)[1] for text in mistakes(tmp_path, document)]
+    assert messages == [f"{key}: found {shown}, expected a mapping" for key in ("objects", "noise", "observations")]
 
 
 def test_a_broken_profile_does_not_fall_back_to_a_built_in_one(tmp_path):
@@ -121,7 +121,7 @@ def test_an_alias_that_contains_itself_causes_no_others(tmp_path):
     assert mistakes(tmp_path, document) == ["hand.yaml:11:12: sensors.touch.feels[1]: this alias contains itself"]
 
 
-def test_merged_sensors_report_at_the_place_that_counts(tmp_path):
+def test_mistakes_in_merged_sensors_are_located_at_the_value_used(tmp_path):
     document = DOCUMENT.replace("  touch:\n", "  touch: &touch\n")
     document += "  depth:\n    gate: far\n    kind: contact_depth\n    <<: *touch\n"
     assert mistakes(tmp_path, document) == [
@@ -157,14 +157,14 @@ def test_overrides_replace_values(tmp_path):
         ("resolution", "[", "--set resolution=[:1:2: not YAML: expected the node content, but found '<stream end>'"),
     ],
 )
-def test_overrides_that_are_wrong(tmp_path, key, text, message):
+def test_wrong_overrides_are_refused(tmp_path, key, text, message):
     message = message or f"--set {key}={text}: {key}: does not lead to a key of a mapping"
-    found = mistakes(tmp_path, overrides={key: text})
-    assert message in found
-    assert all(line.startswith("--set ") for line in found)
+    messages = mistakes(tmp_path, overrides={key: text})
+    assert message in messages
+    assert all(line.startswith("--set ") for line in messages)
 
 
-def test_a_document_built_in_python(tmp_path, monkeypatch):
+def test_documents_can_be_mappings(tmp_path, monkeypatch):
     write(tmp_path)
     monkeypatch.chdir(tmp_path)
     document = {

@@ -1,4 +1,4 @@
-"""Whatever is found in a document, only SpecError is raised, and it says something that can be printed."""
+"""Whatever a document contains, only SpecError is raised, with a printable message."""
 
 import warnings
 from pathlib import Path
@@ -25,28 +25,28 @@ VALUES = st.recursive(
 )
 
 
-def never_another_error(document: object, overrides: dict[str, str] | None = None) -> None:
-    said = "nothing"
-    with warnings.catch_warnings():  # of values that are possible, but unusual
+def assert_only_spec_errors(document: object, overrides: dict[str, str] | None = None) -> None:
+    message = "nothing"
+    with warnings.catch_warnings():  # unusual but possible values
         warnings.filterwarnings("ignore", r"(?s).*, usually at (most|least) ", UserWarning)
         try:
             load(document, overrides).raise_problems()  # type: ignore[arg-type]
         except SpecError as error:
-            said = str(error)
-    assert said.encode()
+            message = str(error)
+    assert message.encode()
 
 
-def places(value: object, path: tuple = ()) -> list[tuple]:
+def paths_of(value: object, path: tuple = ()) -> list[tuple]:
     inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    return [path] + [place for key, part in inner for place in places(part, (*path, key))]
+    return [path] + [inner_path for key, part in inner for inner_path in paths_of(part, (*path, key))]
 
 
-def test_a_radius_of_a_metre_is_warned_of_and_no_error():
+def test_a_radius_of_a_metre_is_a_warning_not_an_error():
     document = valid()
     document["robot"]["layout"]["resolutions"]["low"]["b"]["points"][0]["radius"] = 1
     with pytest.warns(UserWarning, match=r"points\[0\]\.radius: found 1 m, usually at most 0\.1 m"):
         assert load(document).problems == []
-    never_another_error(document)
+    assert_only_spec_errors(document)
 
 
 def test_the_fuzzed_document_is_valid():
@@ -55,10 +55,10 @@ def test_the_fuzzed_document_is_valid():
 
 @FUZZ
 @given(st.data())
-def test_one_or_two_parts_replaced(data):
+def test_replaced_parts_raise_only_spec_errors(data):
     document = valid()
     for _ in range(data.draw(st.integers(1, 2))):
-        path = data.draw(st.sampled_from(places(document)[1:]))
+        path = data.draw(st.sampled_from(paths_of(document)[1:]))
         parent = document
         for part in path[:-1]:
             parent = parent[part]
@@ -67,13 +67,13 @@ def test_one_or_two_parts_replaced(data):
             parent[data.draw(KEYS_OR_TEXT)] = data.draw(VALUES)
         else:
             parent[path[-1]] = data.draw(VALUES)
-    never_another_error(document)
+    assert_only_spec_errors(document)
 
 
 @FUZZ
 @given(st.dictionaries(KEYS_OR_TEXT, VALUES, max_size=8))
-def test_arbitrary_mappings(document):
-    never_another_error(document)
+def test_arbitrary_mappings_raise_only_spec_errors(document):
+    assert_only_spec_errors(document)
 
 
 LINES = DOCUMENT.splitlines(keepends=True)
@@ -87,23 +87,23 @@ PIECES = st.one_of(
 
 @FUZZ
 @given(text=st.one_of(st.lists(PIECES, max_size=12).map("".join), st.text()))
-def test_arbitrary_text(tmp_path: Path, text):
-    never_another_error(write(tmp_path, text))
+def test_arbitrary_text_raises_only_spec_errors(tmp_path: Path, text):
+    assert_only_spec_errors(write(tmp_path, text))
 
 
 @FUZZ
 @given(data=st.data())
-def test_a_document_with_pieces_put_in(tmp_path: Path, data):
+def test_inserted_text_raises_only_spec_errors(tmp_path: Path, data):
     text = DOCUMENT
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(0, len(text)))
         text = text[:at] + data.draw(PIECES) + text[at + data.draw(st.integers(0, 3)) :]
-    never_another_error(write(tmp_path, text))
+    assert_only_spec_errors(write(tmp_path, text))
 
 
 @FUZZ
 @given(data=st.data())
-def test_arbitrary_overrides(tmp_path: Path, data):
+def test_arbitrary_overrides_raise_only_spec_errors(tmp_path: Path, data):
     key = ".".join(data.draw(st.lists(KEYS_OR_TEXT, min_size=1, max_size=4)))
     text = data.draw(st.one_of(st.text(max_size=10), PIECES))
-    never_another_error(write(tmp_path), {key: text})
+    assert_only_spec_errors(write(tmp_path), {key: text})

@@ -1,4 +1,4 @@
-"""Values that were most likely meant in another unit: a warning at their place, once, and none for what people use."""
+"""Values that were probably meant in another unit give one located warning; common values give none."""
 
 import warnings
 from pathlib import Path
@@ -94,12 +94,12 @@ def warned(path: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_an_unusual_value_is_named_where_it_stands(tmp_path, case):
+def test_an_unusual_value_gives_a_located_warning(tmp_path, case):
     document, message = CASES[case]
     assert warned(write(tmp_path, document)) == [f"hand.yaml:{message}"]
 
 
-def test_in_a_layout_of_its_own_and_in_line(tmp_path):
+def test_unusual_values_in_layouts_are_located(tmp_path):
     text = LAYOUT.replace("radius: 2 mm", "radius: 2", 1)
     assert warned(write(tmp_path, layout=text)) == [
         'layout.yaml:5:52: resolutions.low.index_tip.radius: found 2 m, usually at most 0.1 m; was "2 cm" or "2 mm" meant?'
@@ -115,7 +115,7 @@ def test_in_a_layout_of_its_own_and_in_line(tmp_path):
     )
 
 
-def test_what_people_use_is_not_unusual():
+def test_included_documents_have_no_unusual_values():
     """Warnings are errors."""
     for path in sorted((robots_folder().parent / "examples").glob("*[!n].yaml")):
         load(path).raise_problems()
@@ -123,20 +123,20 @@ def test_what_people_use_is_not_unusual():
         load({"tgdsl": 1, "robot": {"model": robot}, "resolution": "med"}, needs_sensors=False).raise_problems()
 
 
-def test_what_a_warning_proposes_is_usual():
-    for dimension, known in units.UNITS.items():
+def test_proposed_values_are_usual():
+    for dimension, factors in units.UNITS.items():
         for value in (1e-9, 3e-4, 0.2, 15.0, 7e5):
-            found = units.doubt(value, dimension, 1e-3, 2.0)
-            assert (found is None) == (1e-3 <= value <= 2.0)
-            for text in found[1].split('"')[1::2] if found else ():
+            doubt = units.doubt(value, dimension, 1e-3, 2.0)
+            assert (doubt is None) == (1e-3 <= value <= 2.0)
+            for text in doubt[1].split('"')[1::2] if doubt else ():
                 assert 1e-3 <= units.parse(text, dimension) <= 2.0, (dimension, text)
-            if found and not found[1]:
-                assert not any(1e-3 <= value * factor <= 2.0 for factor in known.values())
+            if doubt and not doubt[1]:
+                assert not any(1e-3 <= value * factor <= 2.0 for factor in factors.values())
     assert units.doubt(0.0, "length", 1.0, 2.0) is None
     assert units.doubt(-15.0, "length", 0.0, 2.0) == units.doubt(-15.0, "length", 0.0, 2.0) != None  # noqa: E711
 
 
-def test_a_density_per_square_metre(tmp_path):
+def test_an_unusual_density_of_a_layout_warns(tmp_path):
     (tmp_path / "hand.xml").write_text(
         '<mujoco><worldbody><body name="palm"><geom type="box" size=".05 .05 .01"/></body></worldbody></mujoco>'
     )
@@ -161,7 +161,7 @@ def test_valid_documents_stay_quiet():
         ("2 μm", "length", "2 µm"),
     ],
 )
-def test_units_as_they_are_spelled_elsewhere(text, dimension, meant):
+def test_other_spellings_of_units_get_a_hint(text, dimension, meant):
     with pytest.raises(ValueError) as caught:  # noqa: PT011 - the whole message is compared
         units.parse(text, dimension)
     assert str(caught.value) == f'"{text}" is not a quantity; did you mean "{meant}"?'
@@ -179,14 +179,14 @@ def test_units_as_they_are_spelled_elsewhere(text, dimension, meant):
         ("2 pF", "expected a plain number"),
     ],
 )
-def test_a_unit_where_a_plain_number_is_expected(text, expected):
+def test_a_unit_of_a_plain_number_is_refused(text, expected):
     with pytest.raises(ValueError) as caught:  # noqa: PT011 - the whole message is compared
         units.parse(text, "number")
     assert str(caught.value) == f'"{text}" has a unit, {expected}'
 
 
 @pytest.mark.parametrize(("text", "pascal"), [("0.2 MPa", 2e5), ("200kPa", 2e5), ("200000 Pa", 2e5), (2e5, 2e5)])
-def test_pressures(tmp_path, text, pascal):
+def test_pressures_are_converted(tmp_path, text, pascal):
     document = CASES["pressure"][0].replace("youngs_modulus: 0.2", f"youngs_modulus: {text}")
     (sensor,) = load(write(tmp_path, document)).spec.sensors.values()
     assert sensor.youngs_modulus == pytest.approx(pascal, rel=4e-16)  # type: ignore[attr-defined]

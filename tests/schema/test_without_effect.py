@@ -1,4 +1,4 @@
-"""Fields that another field's value makes meaningless are refused, where they are written."""
+"""Fields without effect because of another field's value are refused at their location."""
 
 import pytest
 

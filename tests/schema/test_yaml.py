@@ -1,11 +1,11 @@
-"""YAML text to plain values and places."""
+"""YAML text to plain values and locations."""
 
 import pytest
 
 from tgdsl.schema import yaml
 
 
-def said(text: str) -> list[str]:
+def messages_of(text: str) -> list[str]:
     return sorted(str(problem) for problem in yaml.parse(text, "f").problems)
 
 
@@ -31,14 +31,14 @@ def said(text: str) -> list[str]:
         ("\ufeffa: 1", {"a": 1}),
     ],
 )
-def test_values_are_those_of_yaml_1_2(text, value):
+def test_values_follow_yaml_1_2(text, value):
     source = yaml.parse(text, "f")
     assert source.problems == []
     assert source.value == value
     assert type(source.value) is type(value)
 
 
-def test_every_key_and_value_has_its_place():
+def test_every_key_and_value_has_a_location():
     source = yaml.parse("a:\n  - b: 1\n    c: [2, 3]\n", "f")
     assert source.keys == {("a",): ("f", 1, 1), ("a", 0, "b"): ("f", 2, 5), ("a", 0, "c"): ("f", 3, 5)}
     assert source.values[()] == ("f", 1, 1)
@@ -48,8 +48,8 @@ def test_every_key_and_value_has_its_place():
     assert [source.get(path) for path in (("z",), ("a", 9), ("a", "b"), ("a", 0, "b", 0))] == [None] * 4
 
 
-def test_a_text_read_twice_is_two_documents():
-    """To override a value of one leaves the other as it was."""
+def test_documents_from_one_text_are_independent():
+    """Overriding a value of one leaves the other unchanged."""
     first = yaml.parse("a: {b: [1]}\na: 2\n", "f")
     first.set("a.b", 5)
     first.value["a"]["c"] = 6
@@ -59,7 +59,7 @@ def test_a_text_read_twice_is_two_documents():
     assert len(second.problems) == 1
 
 
-def test_a_problem_stands_at_the_nearest_place_that_exists():
+def test_a_problem_is_located_at_the_nearest_existing_key():
     source = yaml.parse("a:\n  b: 1\n", "f")
     assert str(source.problem(("a", "b"), "bad")) == "f:2:6: a.b: bad"
     assert str(source.problem(("a", "b"), "bad", on_key=True)) == "f:2:3: a.b: bad"
@@ -90,24 +90,24 @@ def test_a_problem_stands_at_the_nearest_place_that_exists():
         ("[" * 1000, "f:1:1: nested more than 50 deep"),
     ],
 )
-def test_what_is_wrong_as_yaml(text, message):
-    assert said(text) == [message]
+def test_invalid_yaml_is_located(text, message):
+    assert messages_of(text) == [message]
 
 
 def test_control_characters():
-    assert said("a: \0")[0].startswith("f:1:1: not YAML: unacceptable character #x0000")
+    assert messages_of("a: \0")[0].startswith("f:1:1: not YAML: unacceptable character #x0000")
 
 
 def test_nesting_is_bounded():
     assert yaml.parse("[" * 50 + "]" * 50, "f").problems == []
-    assert said("[" * 60 + "]" * 60) == [f"f:1:52: {'[0]' * 51}: nested more than 50 deep"]
+    assert messages_of("[" * 60 + "]" * 60) == [f"f:1:52: {'[0]' * 51}: nested more than 50 deep"]
     loop: dict = {}
     loop["a"] = loop
     source = yaml.from_mapping(loop, "<mapping>")
     assert [problem.what for problem in source.problems] == ["nested more than 50 deep"]
 
 
-def test_an_anchor_may_be_set_anew():
+def test_an_anchor_may_be_redefined():
     assert yaml.parse("a: &x 1\nb: *x\nc: &x 2\nd: *x\n", "f").value == {"a": 1, "b": 1, "c": 2, "d": 2}
 
 
@@ -127,7 +127,7 @@ two: &two {b: 2, c: 2}
         ("{<<: *one, <<: *two}", {"a": 1, "b": 1, "c": 2}),
     ],
 )
-def test_merged_keys_give_way(text, value):
+def test_written_keys_override_merged_ones(text, value):
     source = yaml.parse(f"{MERGED}it: {text}\n", "f")
     assert source.problems == []
     assert source.get(("it",)) == value
@@ -137,8 +137,8 @@ def test_merged_keys_give_way(text, value):
     assert source.values[("it",)] == ("f", 3, 5)
 
 
-def test_a_key_that_is_also_merged_in_stands_once_but_one_written_twice_does_not():
-    assert said(f"{MERGED}it:\n  a: 7\n  <<: *one\n  a: 8\n") == ["f:6:3: it.a: this key stands twice, first in line 4"]
+def test_a_repeated_key_is_refused_but_an_overridden_merge_is_not():
+    assert messages_of(f"{MERGED}it:\n  a: 7\n  <<: *one\n  a: 8\n") == ["f:6:3: it.a: this key stands twice, first in line 4"]
 
 
 def test_mappings_built_in_python_are_read_like_text():

@@ -1,4 +1,4 @@
-"""Fits of what counts mean, against hands whose truth is known; and what the command reads and writes."""
+"""Fits of counts to forces for hands with known parameters, and the command's files."""
 
 import math
 from dataclasses import replace
@@ -41,7 +41,7 @@ def counts_of(force: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("is_mirrored", [False, True])
 @pytest.mark.parametrize("seed", range(6))
-def test_the_truth_comes_back(seed, is_mirrored):
+def test_fits_recover_the_true_parameters(seed, is_mirrored):
     turn = rotation(seed, is_mirrored)
     fit = fit_finger(counts_of(PRESSES, turn), PRESSES)
     assert fit.scale == pytest.approx(SCALE, rel=1e-6)
@@ -52,7 +52,7 @@ def test_the_truth_comes_back(seed, is_mirrored):
     assert np.linalg.det(fit.rotation) == pytest.approx(-1 if is_mirrored else 1)
 
 
-def test_a_tare_that_is_known_needs_no_unloaded_frame():
+def test_a_known_tare_needs_no_unloaded_frame():
     turn, presses = rotation(3), np.repeat(2 * AXES, 2, axis=0)
     fit = fit_finger(counts_of(presses, turn), presses, tare=TARE)
     assert fit.scale == pytest.approx(SCALE, rel=1e-6)
@@ -66,14 +66,14 @@ def test_signs_are_straight_lines_per_axis():
     assert fit.scale == pytest.approx(SCALE)
     noisy = counts_of(PRESSES, turn) + np.random.default_rng(0).normal(size=PRESSES.shape)
     fit = fit_finger(noisy, PRESSES, axes="signs")
-    for axis in range(3):  # force over counts, as np.polyfit has it
+    for axis in range(3):  # force over counts, as by np.polyfit
         slope, height = np.polyfit(noisy[:, axis], PRESSES[:, axis], 1)
         assert fit.scale[axis] == pytest.approx(abs(slope))
         assert fit.tare[axis] == pytest.approx(-height / slope)
 
 
-def test_rounding_to_counts_costs_less_than_a_count():
-    """Each error is at most that of half a count per axis; over many presses the scale errs far less."""
+def test_rounding_errors_stay_below_a_count():
+    """Errors are at most half a count per axis; the scale over many presses is far more accurate."""
     rng, turn = np.random.default_rng(2), rotation(8)
     force = rng.uniform([-2, -2, 0], [2, 2, 5], (400, 3))
     fit = fit_finger(np.round(counts_of(force, turn)), force)
@@ -95,8 +95,8 @@ def test_noise_is_averaged_and_reported():
     assert fit.r_squared == pytest.approx(1 - (expected / force.std(axis=0)) ** 2, abs=0.02)
 
 
-def test_no_rotation_and_scale_nearby_is_better():
-    """The fit is a minimum: turning it, or changing a scale, makes the errors larger."""
+def test_the_fit_is_a_local_minimum():
+    """Rotating it or changing a scale increases the errors."""
     rng, turn = np.random.default_rng(6), rotation(1)
     force = rng.uniform(-3, 3, (60, 3))
     counts = counts_of(force, turn) + rng.normal(scale=5, size=force.shape)
@@ -124,12 +124,12 @@ def test_no_rotation_and_scale_nearby_is_better():
         (PRESSES[:3], "3 frames, expected at least 4"),
     ],
 )  # fmt: skip
-def test_loads_that_do_not_say_it_all(presses, says):
+def test_insufficient_loads_are_refused(presses, says):
     with pytest.raises(FitError, match=says):
         fit_finger(counts_of(presses, rotation(0)), presses)
 
 
-def test_a_sensor_that_does_not_feel_an_axis():
+def test_a_sensor_that_is_blind_to_an_axis_is_refused():
     counts = counts_of(PRESSES, np.eye(3))
     counts[:, 1] = 5
     with pytest.raises(FitError, match="the fingertip's counts along its y say nothing of the loads"):
@@ -140,7 +140,7 @@ def test_a_sensor_that_does_not_feel_an_axis():
 
 
 def swings(time: np.ndarray, shift: float = 0.0) -> np.ndarray:
-    """A force that comes and goes unevenly, along three axes."""
+    """Return an irregular force along three axes over time."""
     t = time - shift
     press = np.maximum(np.sin(2.1 * t) + 0.5 * np.sin(5.3 * t + 1), 0)
     return np.column_stack([0.5 * press * np.sin(1.7 * t), 0.3 * press * np.cos(2.9 * t), 3 * press])
@@ -151,11 +151,11 @@ def test_a_time_offset_is_found(offset):
     turn, rng = rotation(5, True), np.random.default_rng(0)
     time, known_time = np.cumsum(rng.uniform(0.008, 0.013, 1200)), np.arange(0, 12, 0.01)
     counts = np.round(counts_of(swings(time, offset), turn) + rng.normal(size=(1200, 3)))
-    found = time_offset(time, counts, known_time, swings(known_time), 2.0)
-    assert found == pytest.approx(offset, abs=1e-3)
+    estimated = time_offset(time, counts, known_time, swings(known_time), 2.0)
+    assert estimated == pytest.approx(offset, abs=1e-3)
 
 
-def test_nothing_to_compare_in_time():
+def test_constant_or_disjoint_series_are_refused():
     time = np.arange(0, 5, 0.01)
     with pytest.raises(FitError, match="the counts are always the same"):
         time_offset(time, np.ones((500, 3)), time, swings(time), 1.0)
@@ -184,14 +184,14 @@ def pressed_log(path, force, times, turn=None, taxels=None):
 
 
 def staircase(now: float) -> np.ndarray:
-    """A press a second."""
+    """Return the press at a time: one per second."""
     return PRESSES[min(int(now), len(PRESSES) - 1)]
 
 
 LOADS = tuple(Load(finger="index", start=i + 0.1, end=i + 0.9, force=tuple(press)) for i, press in enumerate(PRESSES.tolist()))
 
 
-def test_samples_under_loads_and_what_is_left_out(tmp_path):
+def test_saturated_samples_are_left_out(tmp_path):
     times = np.arange(0, len(PRESSES), 0.05)
     log = pressed_log(tmp_path / "a.npz", staircase, times, rotation(2), {25: (3, 99), 26: (3,), 0: (7,)})
     samples = samples_under_loads(TipRecord.of(log), "index", LOADS)
@@ -203,8 +203,8 @@ def test_samples_under_loads_and_what_is_left_out(tmp_path):
     fit = fit_finger(samples.counts, samples.force)
     assert fit.scale == pytest.approx(SCALE, rel=0.02)
     assert report({"index": fit}, {"index": samples})[-1] == "  left out at the end of the range: 2 readings; taxels 3, 99"
-    ignored = samples_under_loads(TipRecord.of(log, (3, 99)), "index", LOADS)
-    assert (ignored.num_left_out, len(ignored.counts)) == (0, len(during))
+    without_taxels = samples_under_loads(TipRecord.of(log, (3, 99)), "index", LOADS)
+    assert (without_taxels.num_left_out, len(without_taxels.counts)) == (0, len(during))
     with pytest.raises(FitError, match="taxels 120: expected numbers from 0 to 119"):
         TipRecord.of(log, (120,))
 
@@ -223,7 +223,7 @@ def test_a_press_beyond_the_range_is_left_out(tmp_path):
         samples_under_loads(TipRecord.of(log), "index", LOADS[8:])
 
 
-def test_loads_that_do_not_fit_the_log(tmp_path):
+def test_loads_outside_the_log_are_refused(tmp_path):
     record = TipRecord.of(pressed_log(tmp_path / "a.npz", staircase, np.arange(0, 2, 0.05)))
     late = Load(finger="index", start=7, end=8, force=(0, 0, 1))
     with pytest.raises(FitError, match=r"index: from 7 s to 8 s the log holds no reading; it goes from 0 s to 1\.942 s"):
@@ -235,7 +235,7 @@ def test_loads_that_do_not_fit_the_log(tmp_path):
         samples_under_forces(record, "index", np.array([50.0, 60.0]), np.zeros((2, 3)))
 
 
-def test_files_of_loads(tmp_path):
+def test_files_of_loads_are_read_and_checked(tmp_path):
     file = tmp_path / "loads.yaml"
     file.write_text("tgdsl: 1\nloads:\n  - {finger: index, start: 500 ms, end: 2, force: [0, 0, -500 mN]}\n")
     assert load_loads(file) == (Load(finger="index", start=0.5, end=2.0, force=(0.0, 0.0, -0.5)),)
@@ -257,12 +257,12 @@ def test_files_of_loads(tmp_path):
 # known forces over time
 
 
-def test_forces_of_a_file(tmp_path):
+def test_forces_are_read_from_a_file(tmp_path):
     time, force = np.arange(3.0), np.arange(45.0).reshape(3, 5, 3)
     np.savez(tmp_path / "a.npz", time=time, tip_force=force)
-    found_time, found = known_tip_forces(tmp_path / "a.npz")
-    assert (found_time == time).all()
-    assert (found["ring"] == force[:, 3]).all()
+    read_time, read_force = known_tip_forces(tmp_path / "a.npz")
+    assert (read_time == time).all()
+    assert (read_force["ring"] == force[:, 3]).all()
     np.savez(tmp_path / "b.npz", time=time, touch=force)
     with pytest.raises(TgdslError, match=r"b\.npz: there is no array tip_force; it holds time, touch"):
         known_tip_forces(tmp_path / "b.npz")
@@ -311,29 +311,32 @@ def touch(tmp_path_factory):
     )
 
 
-def test_forces_of_a_simulation(touch, tmp_path):
+def test_forces_are_read_from_a_simulation(touch, tmp_path):
     rng, time = np.random.default_rng(0), np.arange(4.0)
     shapes = {output.name: output.shape for output in touch.outputs}
     arrays = {name: rng.normal(size=(4, 2, *shape)).astype(np.float32) for name, shape in shapes.items()}
     np.savez(tmp_path / "r.npz", time=time, **arrays)
     bodies = touch.taxels["force"]["body"].tolist()
     assert sorted(bodies) == sorted(["left_hand_mid_link2"] * 3 + ["left_hand_index_rota_link2"] * 2 + ["palm"])
-    own = {"middle": [b == "left_hand_mid_link2" for b in bodies], "index": [b == "left_hand_index_rota_link2" for b in bodies]}
+    masks = {
+        "middle": [b == "left_hand_mid_link2" for b in bodies],
+        "index": [b == "left_hand_index_rota_link2" for b in bodies],
+    }
     for env in (0, 1):
-        found_time, found = simulated_tip_forces(tmp_path / "r.npz", touch, "force", env=env)
-        assert (found_time == time).all()
-        assert sorted(found) == ["index", "middle"]
-        for finger, mask in own.items():
-            assert found[finger] == pytest.approx(arrays["force"][:, env, mask].astype(np.float64).sum(axis=1))
-    _, found = simulated_tip_forces(tmp_path / "r.npz", touch, "depth", depth_scale=100.0)
-    depth = arrays["depth"][:, 0, own["index"], 0].astype(np.float64).sum(axis=1)
-    assert found["index"] == pytest.approx(100 * depth[:, None] * [0, 0.6, 0.8])
-    _, found = simulated_tip_forces(tmp_path / "r.npz", touch, "solver")
+        read_time, read_force = simulated_tip_forces(tmp_path / "r.npz", touch, "force", env=env)
+        assert (read_time == time).all()
+        assert sorted(read_force) == ["index", "middle"]
+        for finger, mask in masks.items():
+            assert read_force[finger] == pytest.approx(arrays["force"][:, env, mask].astype(np.float64).sum(axis=1))
+    _, read_force = simulated_tip_forces(tmp_path / "r.npz", touch, "depth", depth_scale=100.0)
+    depth = arrays["depth"][:, 0, masks["index"], 0].astype(np.float64).sum(axis=1)
+    assert read_force["index"] == pytest.approx(100 * depth[:, None] * [0, 0.6, 0.8])
+    _, read_force = simulated_tip_forces(tmp_path / "r.npz", touch, "solver")
     solver = next(output for output in touch.outputs if output.name == "solver")
     force_x = solver.channels.index("force_x") if "force_x" in solver.channels else None
     assert force_x is not None
     row = solver.bodies.index("left_hand_mid_link2")
-    assert found["middle"] == pytest.approx(arrays["solver"][:, 0, row, force_x : force_x + 3].astype(np.float64))
+    assert read_force["middle"] == pytest.approx(arrays["solver"][:, 0, row, force_x : force_x + 3].astype(np.float64))
     for name, says in [
         ("none", 'the document has no reading "none"; it has force, depth, solver, bit, palm'),
         ("bit", "bit has channels contact, expected forces or depths"),
@@ -345,14 +348,14 @@ def test_forces_of_a_simulation(touch, tmp_path):
         simulated_tip_forces(tmp_path / "r.npz", touch, "force", env=2)
 
 
-# what comes of it
+# calibrations and reports
 
 
 def a_fit(seed: int = 0):
     return fit_finger(counts_of(PRESSES, rotation(seed)), PRESSES)
 
 
-def test_a_calibration_says_what_the_forces_were(tmp_path):
+def test_a_calibration_reproduces_the_forces(tmp_path):
     fit = a_fit()
     tare = np.arange(15.0).reshape(5, 3)
     base = replace(Calibration.none(), tare=tare, hand="mine")
@@ -409,8 +412,8 @@ def test_four_loads_are_enough_and_three_are_not():
         fit_finger(counts_of(force, np.eye(3))[:3], force[:3])
 
 
-def test_counts_that_do_not_follow_their_axis():
-    """All eight presses along ±x, ±y and ±z; the counts along x follow the product of x and y, which correlates with none."""
+def test_counts_that_do_not_follow_their_axis_are_refused():
+    """Counts along x follow the product of x and y over all eight sign patterns, uncorrelated with any axis."""
     presses = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
     counts = presses * [0, 1, 1] + presses[:, :1] * presses[:, 1:2] * [1, 0, 0]
     with pytest.raises(FitError, match="the fingertip's counts along its x do not follow the loads"):
@@ -418,7 +421,7 @@ def test_counts_that_do_not_follow_their_axis():
 
 
 @pytest.mark.parametrize(("units", "expected"), [("N", 0.5), ("counts", None)])
-def test_a_contact_threshold_is_kept_where_its_unit_stays(units, expected):
+def test_a_contact_threshold_is_kept_if_its_unit_stays(units, expected):
     base = replace(Calibration.none(), units=units, contact_threshold=0.5)
     result = calibrated(base, {"index": a_fit()}, "index")
     assert (result.units, result.contact_threshold) == ("N", expected)

@@ -1,4 +1,4 @@
-"""A log of a hand as a recording: the stiffness of a fingertip that pressed a fixture is found; what a log lacks is named."""
+"""Logs of a hand as recordings: fit a fingertip's stiffness from a press, and name what a log lacks."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -27,9 +27,9 @@ SCENE = """
 """
 TIP = "right_hand_index_rota_link2"
 STIFFNESS, PER_COUNT = 400.0, 0.002
-"""Of each taxel [N/m], and of the hand's counts [N]."""
+"""Stiffness of each taxel [N/m], and the hand's force per count [N]."""
 BEND = 0.6
-"""Angle of the index finger's first joint where its tip touches the post [rad]."""
+"""Angle of the index finger's first joint when its tip touches the post [rad]."""
 NEWTONS = replace(Calibration.none(), units="N", scale=np.full((5, 3), PER_COUNT))
 
 
@@ -46,7 +46,7 @@ def document(stiffness=300.0, links=TIP):
 
 
 def posed(angles):
-    """Return the scene in MuJoCo with the hand's joints at some angles [rad], in the order of their ids."""
+    """Return the scene in MuJoCo with the hand's joints at these angles [rad], in the order of their ids."""
     model = mujoco.MjModel.from_xml_path("scene.xml")
     data = mujoco.MjData(model)
     for name, angle in zip(JOINTS, angles, strict=True):
@@ -57,7 +57,7 @@ def posed(angles):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder with a scene: a post stands where the index fingertip is once it is bent."""
+    """Return a folder with a scene: a post at the position of the bent index fingertip."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.xml").write_text(SCENE.format(hand=HAND, pos="0 0 1", joint=""))
     taxels = tgdsl.compile(document()).taxels["tip"]
@@ -75,7 +75,7 @@ def bent(angle):
 
 
 def log_of(folder, calibration=NEWTONS):
-    """Return a log of a hand whose index fingertip presses the post, as its taxels of true stiffness feel it."""
+    """Return a log of a hand whose index fingertip presses the post, with the true stiffness."""
     readings, touch = random_readings(4.0 + np.arange(30) / 30), tgdsl.compile(document(STIFFNESS), dtype="float64")
     states, force = [], np.zeros((30, 5, 3))
     for i, angles in enumerate(bent(BEND + 0.04 * np.sin(np.linspace(0, 6, 30))).astype(np.float32)):
@@ -89,11 +89,11 @@ def log_of(folder, calibration=NEWTONS):
 
 def test_the_stiffness_of_a_fingertip_is_found(folder):
     fit = tgdsl.calibrate(document(), log_of(folder), ["tip.normal_stiffness"])
-    found = fit.parameters["tip.normal_stiffness"]
-    assert found.value == pytest.approx(STIFFNESS, rel=5e-3)
+    parameter = fit.parameters["tip.normal_stiffness"]
+    assert parameter.value == pytest.approx(STIFFNESS, rel=5e-3)
 
 
-def test_what_a_log_lacks_is_named_at_once(folder):
+def test_everything_that_a_log_lacks_is_named_at_once(folder):
     log = log_of(folder, calibration=None)
     (folder / "scene.xml").write_text(SCENE.format(hand=HAND, pos="0 0 1", joint="<freejoint/>"))
     with pytest.raises(SpecError) as error:

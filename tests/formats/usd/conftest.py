@@ -1,4 +1,4 @@
-"""Exported stages that several tests look at."""
+"""Exported stages that several tests share."""
 
 import mujoco
 import pytest

@@ -1,4 +1,4 @@
-"""Actuators that are prims: transmissions, activations, and the drives that say the same."""
+"""Actuators as prims: transmissions, activations, and drives of the same joints."""
 
 import numpy as np
 import pytest
@@ -75,7 +75,7 @@ def test_inherited_ranges_are_the_joints(tmp_path, inherited):
     np.testing.assert_allclose(model.actuator("motor").ctrlrange, [middle - half, middle + half], rtol=1e-6)
 
 
-def test_actuators_without_a_target_are_named(tmp_path):
+def test_actuators_without_a_target_are_dropped_with_a_warning(tmp_path):
     stage = schema_stage(tmp_path)
     actuate(stage, target=["/nowhere"])
     model, messages = warned(stage)
@@ -92,7 +92,7 @@ def test_an_actuator_acts_on_its_first_target_alone(tmp_path, path, name):
     assert [model.joint(int(i)).name for i in model.actuator_trnid[:, 0]] == ["turn", "rail"]
 
 
-def test_two_names_of_one_kind(tmp_path):
+def test_actuators_with_one_name_get_their_paths(tmp_path):
     stage = schema_stage(tmp_path)
     for path in ("/left/grip", "/right/grip"):
         relate(stage.DefinePrim(path, "MjcActuator"), "mjc:target", ["/turn"])
@@ -102,7 +102,7 @@ def test_two_names_of_one_kind(tmp_path):
 
 @pytest.mark.parametrize("stiffness", [3.0, 5.0])
 def test_drives_yield_to_actuators(tmp_path, stiffness):
-    """USD counts a drive in degrees; only one that contradicts is told."""
+    """USD gives drives per degree; only contradicting ones are reported."""
     stage = schema_stage(tmp_path)
     actuate(stage, gainPrm=[3.0], biasPrm=[0.0, -3.0, -0.2], biasType="affine")
     drive = UsdPhysics.DriveAPI.Apply(stage.GetPrimAtPath("/turn"), "angular")
@@ -119,7 +119,7 @@ def test_drives_yield_to_actuators(tmp_path, stiffness):
     assert model.actuator("motor").gainprm[0] == 3.0
 
 
-def test_a_joint_that_has_both_actuators_keeps_mujocos(tmp_path):
+def test_mujocos_actuator_overrides_newtons(tmp_path):
     stage = schema_stage(tmp_path)
     relate(stage.GetPrimAtPath("/servo"), "newton:targets", ["/turn"])
     model, messages = warned(stage)
@@ -127,14 +127,14 @@ def test_a_joint_that_has_both_actuators_keeps_mujocos(tmp_path):
     assert model.nu == 1
 
 
-def test_a_control_without_gains_is_named(tmp_path):
+def test_a_controller_without_gains_is_dropped_with_a_warning(tmp_path):
     stage = schema_stage(tmp_path)
     author(stage.GetPrimAtPath("/servo"), "newton:kp", 0.0)
     _, messages = warned(stage)
     assert messages == ["NewtonActuators were dropped that are no PD control with gains: /servo"]
 
 
-def test_a_tendons_path_must_be_whole(tmp_path):
+def test_incomplete_tendon_paths_are_refused(tmp_path):
     stage = schema_stage(tmp_path)
     author(stage.GetPrimAtPath("/tendon"), "mjc:path:coef", [1.0])
     assert error_of(stage) == "/tendon: mjc:path:coef has 1 numbers; the path has 2 joints"
@@ -143,7 +143,7 @@ def test_a_tendons_path_must_be_whole(tmp_path):
 
 
 def test_a_spatial_tendon_over_a_pulley_and_around_a_ball(tmp_path):
-    """Wraps as MuJoCo has them: site, ball with its side site, site, pulley, site, site."""
+    """Expected wraps: site, ball with its side site, site, pulley, site, site."""
     stage = schema_stage(tmp_path)
     cable = stage.GetPrimAtPath("/cable")
     author(cable, "mjc:path:indices", (0, 1, 2, 0, 2))
@@ -158,8 +158,8 @@ def test_a_spatial_tendon_over_a_pulley_and_around_a_ball(tmp_path):
     assert model.wrap_prm[start : start + 6].tolist() == [0, site, 0, 2, 0, 0]
 
 
-def test_a_tendon_on_no_side_of_a_ball_is_named(tmp_path):
-    """Without its side site it would take the other way around."""
+def test_a_tendon_with_an_invalid_side_site_is_dropped_with_a_warning(tmp_path):
+    """Without its side site it could take the other side."""
     stage = schema_stage(tmp_path)
     relate(stage.GetPrimAtPath("/cable"), "mjc:sideSites", ["/link/seen"])
     author(stage.GetPrimAtPath("/cable"), "mjc:sideSites:indices", (-1, 0, -1))
@@ -168,7 +168,7 @@ def test_a_tendon_on_no_side_of_a_ball_is_named(tmp_path):
     assert [model.tendon(i).name for i in range(model.ntendon)] == ["tendon"]
 
 
-def test_a_tendon_over_nothing_is_named_and_so_is_its_actuator(tmp_path):
+def test_a_tendon_over_nothing_is_dropped_with_its_actuator(tmp_path):
     stage = schema_stage(tmp_path)
     relate(stage.GetPrimAtPath("/tendon"), "mjc:path", ["/turn", "/weld"])
     actuate(stage, target=["/tendon"])
@@ -180,7 +180,7 @@ def test_a_tendon_over_nothing_is_named_and_so_is_its_actuator(tmp_path):
     assert model.ntendon == 1
 
 
-def test_keyframes_of_another_size_are_named(tmp_path):
+def test_keyframes_of_another_size_are_dropped_with_a_warning(tmp_path):
     stage = schema_stage(tmp_path)
     author(stage.GetPrimAtPath("/key"), "mjc:qpos", [0.0, 0.0])
     model, messages = warned(stage)

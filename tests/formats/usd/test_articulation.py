@@ -1,4 +1,4 @@
-"""Which body is the parent of which in a USD stage: trees, loops, names and random robots."""
+"""Kinematic trees of USD stages: parents, loops, names and random robots."""
 
 import math
 
@@ -27,8 +27,8 @@ from stages import (
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_robots_at_random(tmp_path, seed):
-    """Any tree, sides of joints swapped or not, scaled bodies, nested or flat, in centimetres with Y up, anywhere."""
+def test_random_robots_keep_their_poses(tmp_path, seed):
+    """Random trees in centimetres with Y up: joints swapped or not, bodies scaled, nested or flat."""
     random = np.random.default_rng(seed)
     stage = new_stage(tmp_path, metres=0.01, up="Y")
     upright = np.diag([0.01, 0.01, 0.01, 1.0]) @ turn("X", math.pi / 2)
@@ -59,9 +59,9 @@ def test_robots_at_random(tmp_path, seed):
     for i in random.permutation(len(paths)):
         above = [p for p in paths if paths[i].startswith(f"{p}/")]
         outer = poses[paths.index(max(above, key=len))] if above else np.eye(4)
-        own = np.linalg.inv(outer) @ poses[i]
-        quat = Rotation.from_matrix(own[:3, :3]).as_quat(scalar_first=True).tolist()
-        add_body(stage, paths[i], own[:3, 3].tolist(), quat, scales[i])
+        relative = np.linalg.inv(outer) @ poses[i]
+        quat = Rotation.from_matrix(relative[:3, :3]).as_quat(scalar_first=True).tolist()
+        add_body(stage, paths[i], relative[:3, 3].tolist(), quat, scales[i])
     UsdPhysics.ArticulationRootAPI.Apply(stage.GetPrimAtPath("/r/b0"))
     model = compiled(stage)
     for i, pose in enumerate(poses):
@@ -76,13 +76,13 @@ def test_robots_at_random(tmp_path, seed):
 def test_the_root_of_an_articulation(tmp_path, where):
     stage = new_stage(tmp_path)
     chain(stage, 3, axis="Z")
-    if where == "body":  # floating: the marked one is the root, whatever the order of bodies in the joints
+    if where == "body":  # floating: the marked body is the root, whatever the order in the joints
         UsdPhysics.ArticulationRootAPI.Apply(stage.GetPrimAtPath("/b1"))
         model = compiled(stage)
         assert parents(model) == {"b1": "world", "b0": "b1", "b2": "b1"}
         assert model.joint(0).type == mujoco.mjtJoint.mjJNT_FREE
         return
-    joint = add_joint(stage, "/fixture/weld", "fixed", ("/b2", None), pos1=(2, 0, 0))  # the other way around, too
+    joint = add_joint(stage, "/fixture/weld", "fixed", ("/b2", None), pos1=(2, 0, 0))  # with swapped sides
     marked = joint if where == "joint" else UsdGeom.Xform.Define(stage, "/fixture").GetPrim()
     UsdPhysics.ArticulationRootAPI.Apply(marked)
     model = compiled(stage)
@@ -92,7 +92,7 @@ def test_the_root_of_an_articulation(tmp_path, where):
         close(world_pose(model, name, [0, 0])[:3, 3], [x, 0, 0])
 
 
-def test_of_two_joints_to_the_world_the_marked_one_is_the_root(tmp_path):
+def test_the_marked_joint_to_the_world_is_the_root(tmp_path):
     stage = new_stage(tmp_path)
     chain(stage, 3)
     add_joint(stage, "/first", "ball", (None, "/b2"), pos0=(2, 0, 0))
@@ -119,17 +119,17 @@ def test_disabled_bodies_and_joints(tmp_path):
     chain(stage, 3)
     stage.GetPrimAtPath("/b1").GetAttribute("physics:rigidBodyEnabled").Set(False)
     stage.GetPrimAtPath("/j2").GetAttribute("physics:jointEnabled").Set(False)
-    compiled(stage)  # nothing to tell: there is nothing to collide with yet
+    compiled(stage)  # no warning: there is nothing to collide with yet
     add_shape(stage, "/b1/box")
     model, messages = warned(stage)
     assert messages == ["joints do not keep their bodies from colliding with the static prims that they are attached to: /j1"]
     assert parents(model) == {"b0": "world", "b2": "world"}
     assert model.jnt_type.tolist() == [mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE]
-    assert model.geom("box").bodyid == 0  # a static collider where the body is
+    assert model.geom("box").bodyid == 0  # a static collider in the body's pose
     close(model.geom("box").pos, [1, 0, 0])
 
 
-def test_kinematic_bodies_are_moved_by_hand(tmp_path):
+def test_kinematic_bodies_become_mocap_bodies(tmp_path):
     stage = new_stage(tmp_path)
     chain(stage, 2)
     UsdPhysics.RigidBodyAPI(stage.GetPrimAtPath("/b0")).CreateKinematicEnabledAttr(True)
@@ -142,7 +142,7 @@ def test_kinematic_bodies_are_moved_by_hand(tmp_path):
 
 @pytest.mark.parametrize("kind", ["ball", "fixed", "hinge"])
 def test_loops_are_closed_by_constraints(tmp_path, kind):
-    """The constraint's residual vanishes where the frames of the closing joint meet, and not where they do not."""
+    """The constraint's residual vanishes only if the frames of the closing joint meet."""
     stage = new_stage(tmp_path)
     UsdPhysics.ArticulationRootAPI.Apply(add_joint(stage, "/root", "fixed", (None, "/b0")))
     chain(stage, 4, axis="Z")
@@ -153,7 +153,7 @@ def test_loops_are_closed_by_constraints(tmp_path, kind):
     tag = mujoco.mjtEq.mjEQ_WELD if kind == "fixed" else mujoco.mjtEq.mjEQ_CONNECT
     assert model.eq_type.tolist() == [tag] * (2 if kind == "hinge" else 1)
     data = mujoco.MjData(model)
-    square = np.full(3, math.pi / 2)  # four sides of 1 m: the last one ends where the first begins
+    square = np.full(3, math.pi / 2)  # four sides of 1 m form a closed square
     for qpos, is_closed in ((square, kind != "fixed"), (np.zeros(3), False)):
         data.qpos[:] = qpos
         mujoco.mj_forward(model, data)
@@ -166,7 +166,7 @@ def test_loops_are_closed_by_constraints(tmp_path, kind):
             assert np.abs(positions).max() > 0.1
 
 
-def test_an_excluded_joint_that_alone_holds_a_body_is_in_the_tree(tmp_path):
+def test_an_excluded_joint_that_is_a_bodys_only_one_joins_the_tree(tmp_path):
     stage = new_stage(tmp_path)
     chain(stage, 2, excludeFromArticulation=True)
     add_joint(stage, "/root", "fixed", (None, "/b0"), excludeFromArticulation=True)
@@ -175,7 +175,7 @@ def test_an_excluded_joint_that_alone_holds_a_body_is_in_the_tree(tmp_path):
     assert (model.njnt, model.neq) == (1, 0)
 
 
-def test_what_a_loop_or_a_kinematic_body_makes_of_joints(tmp_path):
+def test_properties_lost_by_loops_and_kinematic_bodies_are_named(tmp_path):
     stage = new_stage(tmp_path)
     chain(stage, 3)
     UsdPhysics.RigidBodyAPI(stage.GetPrimAtPath("/b0")).CreateKinematicEnabledAttr(True)
@@ -190,7 +190,7 @@ def test_what_a_loop_or_a_kinematic_body_makes_of_joints(tmp_path):
     assert (model.njnt, model.neq) == (2, 2)
 
 
-def test_of_a_loop_the_joint_is_left_out_with_which_least_is_lost(tmp_path):
+def test_a_loop_is_cut_at_the_joint_with_least_to_lose(tmp_path):
     stage = new_stage(tmp_path)
     chain(stage, 4)
     add_joint(stage, "/first", "slide", ("/b0", "/b3"), (3, 0, 0), lowerLimit=-1.0, upperLimit=1.0)
@@ -202,7 +202,7 @@ def test_of_a_loop_the_joint_is_left_out_with_which_least_is_lost(tmp_path):
     assert model.neq == 2
 
 
-def test_branches_keep_the_order_of_the_keyframe(tmp_path):
+def test_angles_of_branches_reach_the_keyframe(tmp_path):
     stage = new_stage(tmp_path)
     add_joint(stage, "/root", "fixed", (None, "/palm"))
     add_body(stage, "/palm")
@@ -222,7 +222,7 @@ def test_branches_keep_the_order_of_the_keyframe(tmp_path):
         close(key[model.joint(name).qposadr[0]], angle)
 
 
-def test_names_that_whole_paths_share_are_numbered_from_2(tmp_path):
+def test_names_shared_by_whole_paths_are_numbered_from_2(tmp_path):
     stage = new_stage(tmp_path)
     for path in ("/a/b_c", "/x/b_c", "/a_b/c", "/y/c"):
         add_body(stage, path)

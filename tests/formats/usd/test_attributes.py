@@ -1,7 +1,7 @@
-"""Every attribute of the schemas MjcPhysics and Newton's: seen in the compiled model, or named in a warning.
+"""Every attribute of the schemas of MjcPhysics and Newton reaches the compiled model or is named in a warning.
 
-The tables are the schemas' lists of attributes (MjcPhysics in mujoco-usd-converter 0.8, newton-usd-schemas 0.6). What is expected is
-what MJCF's documentation says of the attribute of the same name, and what the schemas say of units.
+The tables are the schemas' lists of attributes (MjcPhysics in mujoco-usd-converter 0.8, newton-usd-schemas 0.6). Expected
+values follow MJCF's documentation of the attribute with the same name, and the schemas' units.
 """
 
 import math
@@ -53,7 +53,7 @@ ENABLED = ("energy", "fwdinv", "invdiscrete", "override")
 
 
 def of(array, kind, name):
-    """Return a reader of an array of the model, at a named element; of a joint's degrees of freedom, the first."""
+    """Return a reader of an array at a named element; for a joint, at its first degree of freedom."""
 
     def read(model):
         index = getattr(model, kind)(name).id
@@ -276,19 +276,19 @@ def flat(table):
 
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory):
-    """The stage without any of the attributes."""
+    """Return the stage without any of the attributes."""
     return schema_stage(tmp_path_factory.mktemp("stage"))
 
 
 @pytest.fixture(scope="module")
 def plain(stage):
-    """Its model."""
+    """Return the model of the stage."""
     return compiled(stage)
 
 
 @contextmanager
 def authored(stage, rows):
-    """Have the stage hold some attributes, rows of prim, name and value, for a while."""
+    """Set attributes of the stage temporarily, from rows of prim, name and value."""
     prims = [(stage.GetPrimAtPath(PRIMS[where]), name, value) for where, name, value in rows]
     for prim, name, value in prims:
         author(prim, name, value)
@@ -300,7 +300,7 @@ def authored(stage, rows):
 
 
 def in_rounds(rows):
-    """Split rows into rounds: one attribute of each prim; all options of the scene in the first round, all flags in the second."""
+    """Split rows into rounds of one attribute per prim, except all options in the first and all flags in the second."""
     rounds, following = defaultdict(list), Counter(scene=2)
     for row in rows:
         where, name = row[:2]
@@ -314,7 +314,7 @@ def in_rounds(rows):
 
 
 def test_each_attribute_of_the_schemas_sets_its_field(stage, plain, subtests):
-    """No attribute causes a warning: warnings are errors."""
+    """Warnings are errors, so no attribute causes one."""
     with authored(stage, [("key", "mjc:ctrl", [0.0, 0.0])]):
         with_key = compiled(stage)
     for rows in in_rounds(SEEN):
@@ -327,8 +327,8 @@ def test_each_attribute_of_the_schemas_sets_its_field(stage, plain, subtests):
 
 
 @pytest.mark.parametrize("is_auto", [True, False], ids=["auto", "explicit"])
-def test_limits_hold_as_the_compiler_says(tmp_path, is_auto):
-    """`auto` and `autoLimits` as in MJCF: a range is enough, or it never is; `true` and `false` are just that."""
+def test_limits_follow_the_compilers_autolimits(tmp_path, is_auto):
+    """As in MJCF: with `auto`, `autoLimits` decides whether a range suffices; `true` and `false` are explicit."""
     expected = {("auto", True): 1, ("auto", False): 0, ("true", False): 1, ("false", True): 0}
     for (token, is_autolimited), limited in expected.items():
         stage = schema_stage(tmp_path, f"{token}_{is_autolimited}.usda")
@@ -362,7 +362,7 @@ def test_default_values_change_nothing(stage, plain):
         assert differing_fields(plain, compiled(stage)) == []
 
 
-def test_newtons_values_are_in_the_stages_units(tmp_path):
+def test_newtons_values_have_the_stages_units(tmp_path):
     """A stage in centimetres: lengths shrink by 100, torques by 10⁴; damping is per degree."""
     stage = schema_stage(tmp_path, metres=0.01)
     for where, name, value in (
@@ -387,7 +387,7 @@ def test_newtons_values_are_in_the_stages_units(tmp_path):
     np.testing.assert_allclose(model.actuator("servo").forcerange, [-0.07, 0.07])
 
 
-def test_angles_are_in_the_compilers_unit(tmp_path):
+def test_angles_have_the_compilers_unit(tmp_path):
     stage = schema_stage(tmp_path)
     author(stage.GetPrimAtPath("/scene"), "mjc:compiler:angle", "radian")
     for name in ("mjc:ref", "mjc:springref"):
@@ -396,8 +396,8 @@ def test_angles_are_in_the_compilers_unit(tmp_path):
     assert (model.qpos0[0], model.qpos_spring[0]) == (0.25, 0.25)
 
 
-def test_the_time_step_of_newtons_scene_is_its_schemas(tmp_path):
-    """Writers leave out defaults: 1000 steps a second where the scene names NewtonSceneAPI, MuJoCo's 0.002 s where it does not."""
+def test_newtons_default_time_step_applies_to_its_scenes(tmp_path):
+    """Writers omit defaults: 1000 steps per second with NewtonSceneAPI, otherwise MuJoCo's 0.002 s."""
     for is_named, expected in ((False, 0.002), (True, 0.001)):
         stage = schema_stage(tmp_path, f"{is_named}.usda")
         if is_named:

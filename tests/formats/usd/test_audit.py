@@ -1,10 +1,10 @@
-"""What is authored and nobody reads is named; what has no meaning for physics is not."""
+"""Authored values that are not read are named, unless they do not matter to physics."""
 
 from schema_stages import author, relate, schema_stage
 from stages import compiled, error_of, path_of, warned
 
 
-def test_schemas_and_types_that_nobody_knows_are_named(tmp_path):
+def test_unknown_schemas_and_types_are_named(tmp_path):
     stage = schema_stage(tmp_path)
     stage.GetPrimAtPath("/turn").AddAppliedSchema("NewtonKaminoSceneAPI")
     stage.DefinePrim("/deformable", "NewtonSponge")
@@ -15,7 +15,7 @@ def test_schemas_and_types_that_nobody_knows_are_named(tmp_path):
     ]
 
 
-def test_looks_and_bookkeeping_are_passed_over(tmp_path):
+def test_looks_and_bookkeeping_are_ignored(tmp_path):
     stage = schema_stage(tmp_path)
     prim = stage.GetPrimAtPath("/link/ball")
     for name, value in (

@@ -1,4 +1,4 @@
-"""Joints that follow, joints that stack, ranges of ball joints, and masses as MuJoCo takes them."""
+"""Mimic joints, stacked joints, ranges of ball joints, and masses by MuJoCo's rules."""
 
 import mujoco
 import numpy as np
@@ -24,7 +24,7 @@ from stages import (
 
 
 def lead_and_follow(folder, kind="hinge"):
-    """Return a stage with two joints of a kind, each on a base that does not move."""
+    """Return a stage with two joints of a kind on a fixed base."""
     stage = stage_with_base(folder)
     for end in ("lead", "follow"):
         add_body(stage, f"/{end}er")
@@ -33,8 +33,8 @@ def lead_and_follow(folder, kind="hinge"):
 
 
 @pytest.mark.parametrize(("kind", "offset"), [("hinge", np.radians(10.0)), ("slide", 10.0)])
-def test_followers(tmp_path, kind, offset):
-    """Follower = coef0 + coef1 leader, with coef0 in degrees where it turns; the rest of the polynomial is MuJoCo's."""
+def test_a_follower_is_a_polynomial_of_its_leader(tmp_path, kind, offset):
+    """Follower = coef0 + coef1 leader, with coef0 in degrees for hinges; higher coefficients are MuJoCo's."""
     stage = lead_and_follow(tmp_path, kind)
     follower = stage.GetPrimAtPath("/follow")
     apply(follower, "NewtonMimicAPI", "MjcEqualityJointAPI")
@@ -54,7 +54,7 @@ def test_followers(tmp_path, kind, offset):
     assert compiled(stage).eq_active0.tolist() == [0]
 
 
-def test_followers_by_mujocos_old_names(tmp_path):
+def test_followers_accept_mujocos_old_names(tmp_path):
     stage = lead_and_follow(tmp_path)
     follower = stage.GetPrimAtPath("/follow")
     apply(follower, "MjcEqualityJointAPI")
@@ -64,7 +64,7 @@ def test_followers_by_mujocos_old_names(tmp_path):
     np.testing.assert_allclose(compiled(stage).eq_data[0, :5], [0.2, 3, 0, 0, 0])
 
 
-def test_a_leader_that_is_no_joint_of_the_tree_is_named(tmp_path):
+def test_a_leader_outside_the_tree_is_named(tmp_path):
     stage = lead_and_follow(tmp_path)
     apply(stage.GetPrimAtPath("/follow"), "NewtonMimicAPI")
     relate(stage.GetPrimAtPath("/follow"), "newton:mimicJoint", ["/fixed"])
@@ -75,7 +75,7 @@ def test_a_leader_that_is_no_joint_of_the_tree_is_named(tmp_path):
 
 @pytest.mark.parametrize("by", ["joint", "articulation"])
 def test_joints_between_the_same_bodies_stack(tmp_path, by):
-    """Two slides and a hinge, in stage order: MuJoCo's kinematics is their product."""
+    """Two slides and a hinge in stage order: the pose is their product."""
     stage = stage_with_base(tmp_path)
     add_body(stage, "/puck")
     for name, kind, axis in (("x", "slide", "X"), ("turn", "hinge", "Z"), ("y", "slide", "Y")):
@@ -109,7 +109,7 @@ def turned(angle):
 
 @pytest.mark.parametrize("swapped", [("turn",), ("x",), ("x", "turn"), ("y",), ("x", "turn", "y")])
 def test_stacked_joints_may_name_the_two_bodies_in_any_order(tmp_path, swapped):
-    """A joint moves its body 1 against its body 0; stage order counts from body 0 of the first, whichever body is the parent."""
+    """A joint moves body 1 against body 0; the order starts at body 0 of the first joint, whichever is the parent."""
     stage = stage_with_base(tmp_path)
     add_body(stage, "/puck")
     for name, kind, axis in (("x", "slide", "X"), ("turn", "hinge", "Z"), ("y", "slide", "Y")):
@@ -119,15 +119,15 @@ def test_stacked_joints_may_name_the_two_bodies_in_any_order(tmp_path, swapped):
     assert model.neq == 0 and model.njnt == 3
     values = {"x": 0.3, "turn": 0.7, "y": -0.2}
     moves = {"x": slid(0.3, 0.0), "turn": turned(0.7), "y": slid(0.0, -0.2)}
-    is_back = "x" in swapped  # the product is then the base's pose against the puck
+    is_back = "x" in swapped  # then the product is the base's pose relative to the puck
     chain = [np.linalg.inv(move) if (name in swapped) != is_back else move for name, move in moves.items()]
     pose = chain[0] @ chain[1] @ chain[2]
-    found = world_pose(model, "puck", [values[model.joint(i).name] for i in range(3)])
-    close(found, np.linalg.inv(pose) if is_back else pose)
+    measured = world_pose(model, "puck", [values[model.joint(i).name] for i in range(3)])
+    close(measured, np.linalg.inv(pose) if is_back else pose)
 
 
 @pytest.mark.parametrize("name", ["newton:mimicJoint", "mjc:target"])
-def test_a_joint_that_follows_two_is_an_error(tmp_path, name):
+def test_a_joint_with_two_leaders_is_refused(tmp_path, name):
     stage = lead_and_follow(tmp_path)
     follower = stage.GetPrimAtPath("/follow")
     apply(follower, "NewtonMimicAPI", "MjcEqualityJointAPI")
@@ -137,13 +137,15 @@ def test_a_joint_that_follows_two_is_an_error(tmp_path, name):
 
 
 @pytest.mark.parametrize("path", ["/connect", "/weld"])
-def test_constraints_that_are_disabled_start_inactive(tmp_path, path):
+def test_disabled_constraints_start_inactive(tmp_path, path):
     stage = schema_stage(tmp_path)
     joints = [prim for prim in stage.Traverse() if prim.GetName() == path[1:]]
     joints[0].GetAttribute("physics:jointEnabled").Set(False)
     model = compiled(stage)
     kind = mujoco.mjtEq.mjEQ_WELD if path == "/weld" else mujoco.mjtEq.mjEQ_CONNECT
-    assert [bool(active) for active in model.eq_active0] == [int(own) != int(kind) for own in model.eq_type]
+    assert [bool(active) for active in model.eq_active0] == [
+        int(constraint_kind) != int(kind) for constraint_kind in model.eq_type
+    ]
 
 
 def test_the_range_of_a_ball_joint_is_its_cone(tmp_path):
@@ -165,7 +167,7 @@ def test_a_full_inertia_overrules_the_principal_one(tmp_path):
 
 @pytest.mark.parametrize("schema", [{"newton:massModel": "shell"}, {"mjc:shellinertia": True}], ids=["newton", "mjc"])
 @pytest.mark.parametrize("thickness", [None, 0.01])
-def test_shells(tmp_path, schema, thickness):
+def test_shells_weigh_by_area_or_thickness(tmp_path, schema, thickness):
     """A spherical shell: 4πr² times its density (per area, or times its thickness), with 2/3 m r²."""
     stage = new_stage(tmp_path)
     add_body(stage, "/body", mass=0)
@@ -182,7 +184,7 @@ def test_shells(tmp_path, schema, thickness):
 
 
 @pytest.mark.parametrize("model", ["legacy", "convex", "exact", "shell"])
-def test_meshes_weigh_as_mujoco_takes_them(tmp_path, model):
+def test_meshes_weigh_by_mujocos_inertia_option(tmp_path, model):
     """A tetrahedron with edges 3, 2 and 1 m: its volume is 1 m³, and the area of its faces 3 + 1 + 1.5 + 3.5 m²."""
     stage = new_stage(tmp_path)
     add_body(stage, "/body", mass=0)
@@ -194,7 +196,7 @@ def test_meshes_weigh_as_mujoco_takes_them(tmp_path, model):
 
 
 @pytest.mark.parametrize("name", ["mjc:maxhullvert", "newton:maxHullVertices"])
-def test_hulls_have_as_many_corners_as_is_said(tmp_path, name):
+def test_hulls_have_the_given_number_of_corners(tmp_path, name):
     generator = np.random.default_rng(0)
     points = generator.normal(size=(60, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
@@ -218,7 +220,7 @@ def mujoco_hull(points):
     return np.where(is_wrong[:, None], hull.simplices[:, ::-1], hull.simplices)
 
 
-def test_sites_are_drawn_as_their_gprims(tmp_path):
+def test_sites_have_the_shape_of_their_gprims(tmp_path):
     stage = schema_stage(tmp_path)
     stage.GetPrimAtPath("/link/site").GetAttribute("radius").Set(0.04)
     model = compiled(stage)
@@ -227,8 +229,8 @@ def test_sites_are_drawn_as_their_gprims(tmp_path):
     assert "site" not in [model.geom(i).name for i in range(model.ngeom)]
 
 
-def test_equality_constraints_hold_where_the_joint_frames_are(tmp_path):
-    """The joints MjcEqualityConnectAPI and WeldAPI join bodies of the tree without being part of it."""
+def test_equality_constraints_hold_at_the_joint_frames(tmp_path):
+    """Joints with MjcEqualityConnectAPI and WeldAPI join bodies of the tree without being part of it."""
     model = compiled(schema_stage(tmp_path))
     assert sorted(model.eq_type.tolist()) == [mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD]
     assert [model.joint(i).name for i in range(model.njnt)] == ["turn", "rail", "socket"]

@@ -1,4 +1,4 @@
-"""What USD has no word for comes back through our own attributes, and yields to what a user has edited in the stage."""
+"""Custom attributes keep values that USD cannot express, and yield to edits of the stage."""
 
 from pathlib import Path
 
@@ -45,7 +45,7 @@ OPTIONS |= {"ccd_iterations": "40", "ccd_tolerance": "1e-5", "sdf_iterations": "
 OPTIONS |= {"magnetic": "0 .1 .2", "o_margin": "0.001", "o_solref": ".03 1.1", "o_solimp": ".8 .9 .002 .4 3"}
 OPTIONS |= {"o_friction": ".9 .9 .006 .0002 .0002"}
 EXACT = 1e-14
-"""Relative: an exporter that keeps 15 digits, and conversions to degrees and back."""
+"""Relative: the exporter keeps 15 digits, and angles convert to degrees and back."""
 
 
 def exported(folder: Path, option: str = "", flags: str = "") -> Path:
@@ -55,7 +55,7 @@ def exported(folder: Path, option: str = "", flags: str = "") -> Path:
 
 
 def pair(folder: Path, option: str = "", flags: str = "") -> tuple[mujoco.MjModel, mujoco.MjModel]:
-    """Return a model, and what it comes back as."""
+    """Return a model before and after the round trip."""
     stage = exported(folder, option, flags)
     return load_model(folder / "notes.xml").compiled, load_model(stage).compiled
 
@@ -106,14 +106,14 @@ def test_options(tmp_path):
     ("key", "bits", "prefix"), [("disable", mujoco.mjtDisableBit, "mjDSBL_"), ("enable", mujoco.mjtEnableBit, "mjENBL_")]
 )
 def test_flags(tmp_path, key, bits, prefix):
-    """All but gravity and collisions with parents, of which USD has attributes."""
+    """All but gravity and collisions with parents, which have USD attributes."""
     names = {name.removeprefix(prefix).lower() for name in bits.__members__ if name.startswith(prefix)}
     names -= {"gravity", "filterparent", "ipc"}
     first, second = pair(tmp_path, flags=" ".join(f'{name}="{key}"' for name in sorted(names)))
-    own = [getattr(model.opt, f"{key}flags") for model in (first, second)]
+    flags_of_models = [getattr(model.opt, f"{key}flags") for model in (first, second)]
     parents = int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT) if key == "disable" else 0
-    assert own[0].bit_count() == len(names)
-    assert own[0] | parents == own[1] | parents
+    assert flags_of_models[0].bit_count() == len(names)
+    assert flags_of_models[0] | parents == flags_of_models[1] | parents
 
 
 @pytest.mark.parametrize(
@@ -126,15 +126,15 @@ def test_flags(tmp_path, key, bits, prefix):
     ],
     ids=["mass", "friction", "armature", "damping"],
 )
-def test_what_is_edited_in_the_stage_counts(tmp_path, path, name, value, array, expected):
-    """A twin that USD's own value is no longer rounded from is void; a joint's own damping is at most its drive's."""
+def test_edits_of_the_stage_count(tmp_path, path, name, value, array, expected):
+    """A custom twin is ignored if USD's value is no longer its rounding; a joint's damping is at most its drive's."""
     file = exported(tmp_path)
-    before = getattr(load_model(file).compiled, array)
+    unedited = getattr(load_model(file).compiled, array)
     stage = Usd.Stage.Open(str(file))
     stage.GetPrimAtPath(path).GetAttribute(name).Set(value)
     stage.Save()
-    after = getattr(load_model(file).compiled, array)
-    changed = after[after != before]
+    edited = getattr(load_model(file).compiled, array)
+    changed = edited[edited != unedited]
     np.testing.assert_allclose(changed, expected, rtol=1e-6)
     assert len(changed) == 1
 
@@ -149,10 +149,10 @@ def test_a_damped_joint_without_a_servo_has_no_actuator(tmp_path):
     assert door.joint("hinge").damping[0] == 0.3
 
 
-def test_meshes_of_one_name_are_kept_apart(tmp_path):
-    """One mesh has the name that another geom would give to its own."""
+def test_meshes_with_one_name_stay_separate(tmp_path):
+    """One mesh has the name that another geom would give its mesh."""
     corners = [" ".join(map(str, size * np.array([0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1]))) for size in (0.1, 0.2, 0.3)]
-    meshes = "".join(f"<mesh name='{name}' vertex='{own}'/>" for name, own in zip("abc", corners, strict=True))
+    meshes = "".join(f"<mesh name='{name}' vertex='{vertices}'/>" for name, vertices in zip("abc", corners, strict=True))
     (tmp_path / "m.xml").write_text(
         f"<mujoco><asset>{meshes}</asset><worldbody><body><geom name='b' type='mesh' mesh='a'/>"
         "<geom name='c' type='mesh' mesh='b'/><geom name='d' type='mesh' mesh='c'/></body></worldbody></mujoco>"
@@ -166,7 +166,7 @@ def test_meshes_of_one_name_are_kept_apart(tmp_path):
 
 
 def test_a_mesh_keeps_its_vertices_its_hull_and_its_name(tmp_path):
-    """A regular prism: which of its equal corners make a hull of few vertices depends on the last bit of each."""
+    """A regular prism: the choice of corners for a small hull depends on the last bits."""
     angles = 2 * np.pi * np.arange(40) / 40
     ring = np.round(0.01 * np.stack([np.cos(angles), np.sin(angles)], axis=1), 6)
     points = np.concatenate([np.c_[ring, np.full(40, z)] for z in (0.003, 0.041)])

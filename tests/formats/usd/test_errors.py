@@ -1,4 +1,4 @@
-"""Every mistake in a USD stage, by its prim."""
+"""Every mistake in a USD stage is reported with its prim."""
 
 import builtins
 import math
@@ -47,7 +47,7 @@ def test_unresolved_references(tmp_path, capfd):
     file.write_text("#usda 1.0\n(\n  subLayers = [@gone.usda@]\n)\n")
     with pytest.raises(RobotError, match=r"layers\.usda: /: .*gone\.usda"):
         usd_to_mjcf(file)
-    assert capfd.readouterr() == ("", "")  # USD prints nothing of its own
+    assert capfd.readouterr() == ("", "")  # USD prints nothing itself
 
 
 def test_files_that_are_not_usd(tmp_path):
@@ -68,7 +68,7 @@ def test_a_stage_without_a_robot(tmp_path):
 
 
 @pytest.mark.parametrize("limits", [{}, dict.fromkeys(GENERIC[:4], (1.0, -1.0)), dict.fromkeys(GENERIC[1:3], (1.0, -1.0))])
-def test_generic_joints_that_are_none_of_mujocos(tmp_path, limits):
+def test_generic_joints_without_a_mujoco_type_are_refused(tmp_path, limits):
     stage = new_stage(tmp_path)
     generic(stage, limits or {"distance": (0.1, 0.2)})
     free = [dof for dof in GENERIC if dof not in limits]
@@ -77,7 +77,7 @@ def test_generic_joints_that_are_none_of_mujocos(tmp_path, limits):
     )
 
 
-def test_joints_that_mujoco_does_not_have(tmp_path):
+def test_joints_unknown_to_mujoco_are_refused(tmp_path):
     stage = new_stage(tmp_path)
     chain(stage, 2)
     add_joint(stage, "/far", "distance", ("/b0", "/b1"))
@@ -91,7 +91,7 @@ def test_joints_that_mujoco_does_not_have(tmp_path):
     assert error_of(stage) == "/loop: a prismatic joint closes a loop, for which MuJoCo has no constraint"
 
 
-def test_joints_that_join_what_is_not_there(tmp_path):
+def test_invalid_joints_filters_and_gravity_are_refused(tmp_path):
     stage = new_stage(tmp_path)
     chain(stage, 2)
     joint = UsdPhysics.Joint(stage.GetPrimAtPath("/j1"))
@@ -136,7 +136,7 @@ def test_joints_that_join_what_is_not_there(tmp_path):
         (QUAD, [(0, 1, 2, 3)], "the mesh is flat: it has no hull to collide; use a plane or a thin box"),
     ],
 )
-def test_broken_meshes(tmp_path, points, faces, message):
+def test_broken_meshes_are_refused(tmp_path, points, faces, message):
     stage = new_stage(tmp_path)
     add_body(stage, "/b")
     prim = add_mesh(stage, "/b/m", points, faces)
@@ -153,7 +153,7 @@ def test_flat_meshes_can_be_seen(tmp_path):
     assert compiled(stage).geom("sheet").group == 2
 
 
-def test_transforms_that_are_none(tmp_path):
+def test_invalid_transforms_are_refused(tmp_path):
     stage = new_stage(tmp_path)
     prim = add_body(stage, "/b")
     prim.GetAttribute("xformOp:translate").Set(Gf.Vec3d(math.nan, 0, 0))
@@ -166,7 +166,7 @@ def test_transforms_that_are_none(tmp_path):
     assert error_of(stage) == "/b/box: its transform is flat: a scale is zero"
 
 
-def test_bodies_that_cannot_be(tmp_path):
+def test_impossible_bodies_are_refused(tmp_path):
     stage = new_stage(tmp_path)
     prim = add_body(stage, "/b", mass=0)
     assert error_of(stage) == "/b: the body can move, but has neither mass nor colliders"

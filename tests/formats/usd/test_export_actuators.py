@@ -1,4 +1,4 @@
-"""Actuators of every kind, tendons, springs and keyframes go through USD and come back: the same model, the same motion."""
+"""Actuators of every kind, tendons, springs and keyframes keep model and motion through USD."""
 
 import mujoco
 import numpy as np
@@ -69,9 +69,9 @@ ACTUATOR = ("trntype", "dyntype", "gaintype", "biastype", "dynprm", "gainprm", "
 ACTUATOR += ("forcelimited", "forcerange", "actlimited", "actrange", "actearly", "lengthrange", "cranklength", "group", "delay")
 ACTUATOR += ("history", "armature", "actnum")
 EXACT = 1e-12
-"""Relative: 15 digits, and conversions to degrees and back."""
+"""Relative: 15 digits, and angles convert to degrees and back."""
 FULL_SCALE = 1e-6
-"""Largest difference over a run, of the largest value: rounding of 1e-16, which contacts amplify."""
+"""Largest difference over a run, relative to the largest value: contacts amplify rounding of 1e-16."""
 STEPS = 500
 
 
@@ -113,13 +113,13 @@ def test_tendons(twins, array):
 def test_options_and_keyframes(twins):
     first, second = twins
     assert second.opt.timestep == first.opt.timestep == 0.003
-    own, other = first.key("up"), second.key("up")
+    first_key, second_key = first.key("up"), second.key("up")
     for vector in ("qpos", "qvel", "ctrl", "time"):
-        np.testing.assert_array_equal(getattr(own, vector), getattr(other, vector))
+        np.testing.assert_array_equal(getattr(first_key, vector), getattr(second_key, vector))
 
 
 def test_the_same_forces_at_any_state(twins):
-    """MuJoCo's own: forces of all actuators, springs and tendons."""
+    """MuJoCo's forces of all actuators, springs and tendons."""
     generator = np.random.default_rng(0)
     states = [mujoco.MjData(model) for model in twins]
     for _ in range(20):
@@ -134,7 +134,7 @@ def test_the_same_forces_at_any_state(twins):
 
 
 def test_the_same_squeeze(twins):
-    """The fingers close on the cube: positions, actuators' forces and the contacts' over 500 steps."""
+    """The fingers close on the cube: compare positions, actuator forces and contact forces over 500 steps."""
     runs = []
     for model in twins:
         state = mujoco.MjData(model)

@@ -1,4 +1,4 @@
-"""Equality constraints go through USD and come back: the same constraints, the same motion."""
+"""Equality constraints keep their values and motion through USD."""
 
 import mujoco
 import numpy as np
@@ -59,12 +59,12 @@ HAND = """
   </equality>
 </mujoco>
 """
-"""Every kind: between bodies, sites, the world, a mocap body; on joints with `ref`, and twice on one; named and unnamed."""
+"""Every kind: between bodies, sites, the world and a mocap body; on joints with `ref`, two on one; named or not."""
 EXACT = 1e-12
-"""Absolute: 15 digits of what is of the order of 1."""
+"""Absolute: 15 digits of values of the order of 1."""
 STEPS, APART = 500, 1e-6
 ANGLES = slice(6, 10)
-"""Of a weld's numbers, the quaternion: its sign means nothing. The last, 11, says whether MuJoCo chose the pose."""
+"""The quaternion of a weld, whose sign is arbitrary. The last number, 11, says whether MuJoCo chose the pose."""
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +97,7 @@ def test_a_coupling_that_is_off_stays_off(tmp_path):
 
 @pytest.mark.parametrize("chosen", ["as written", "all others"])
 def test_the_same_motion(twins, chosen):
-    """Positions of all bodies over 500 steps; then with the constraints that were off, and without the others."""
+    """Positions of all bodies over 500 steps, as written and with inverted active flags."""
     states = [mujoco.MjData(model) for model in twins]
     for model, state in zip(twins, states, strict=True):
         state.qvel[:] = np.random.default_rng(0).normal(size=model.nv) * 0.05
@@ -112,8 +112,8 @@ def test_the_same_motion(twins, chosen):
     assert moved > 0.05
 
 
-def test_what_other_programs_find(tmp_path):
-    """A spherical joint outside of the articulation, its frames at MuJoCo's anchors; a coupling in positions and degrees."""
+def test_other_programs_find_standard_joints_and_couplings(tmp_path):
+    """A spherical joint outside the articulation with frames at MuJoCo's anchors; a coupling in degrees."""
     (tmp_path / "hand.xml").write_text(HAND)
     export_model(tmp_path / "hand.xml", tmp_path / "hand.usda")
     stage = Usd.Stage.Open(str(tmp_path / "hand.usda"))
@@ -136,21 +136,21 @@ def test_what_other_programs_find(tmp_path):
     leader = 0.37
     moved = leader - 0.2
     expected = -0.1 + 0.05 + 0.7 * moved + 0.2 * moved**2 - 0.1 * moved**3 + 0.05 * moved**4
-    found = np.radians(values[0]) + sum(value * leader ** (i + 1) for i, value in enumerate(values[1:]))
-    assert found == pytest.approx(expected, abs=1e-8)
+    position = np.radians(values[0]) + sum(value * leader ** (i + 1) for i, value in enumerate(values[1:]))
+    assert position == pytest.approx(expected, abs=1e-8)
 
 
-def test_a_polynomial_of_displacements_as_one_of_positions():
+def test_polynomials_of_displacements_convert_to_positions():
     coefficients = np.array([0.3, -1.2, 0.5, 0.7, -0.4])
-    found = shifted(coefficients, 0.6, -0.25)
+    converted = shifted(coefficients, 0.6, -0.25)
     for leader in (-1.0, 0.0, 0.4):
         x = leader + 0.25
         expected = 0.6 + 0.3 - 1.2 * x + 0.5 * x**2 + 0.7 * x**3 - 0.4 * x**4
-        assert found @ leader ** np.arange(5) == pytest.approx(expected, abs=1e-14)
+        assert converted @ leader ** np.arange(5) == pytest.approx(expected, abs=1e-14)
 
 
 def test_an_edit_of_the_stage_counts(tmp_path):
-    """A connect's anchor and whether it is on are what USD's own attributes say."""
+    """USD's attributes decide a connect's anchor and whether it is active."""
     (tmp_path / "hand.xml").write_text(HAND)
     export_model(tmp_path / "hand.xml", tmp_path / "hand.usda")
     stage = Usd.Stage.Open(str(tmp_path / "hand.usda"))
@@ -175,6 +175,6 @@ def test_constraints_of_flexes_are_named(tmp_path):
     with pytest.warns(UserWarning, match="left out") as caught:
         export_model(tmp_path / "robot.xml", tmp_path / "robot.usda")
     assert [str(warning.message) for warning in caught] == [
-        f"{tmp_path / 'robot.xml'}: {what} left out"
-        for what in ('equality constraint "taut" is of a flex, which USD does not have:', "USD holds no flexes: 1")
+        f"{tmp_path / 'robot.xml'}: {subject} left out"
+        for subject in ('equality constraint "taut" is of a flex, which USD does not have:', "USD holds no flexes: 1")
     ]

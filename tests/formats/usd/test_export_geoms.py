@@ -1,4 +1,4 @@
-"""Geoms that are exported: they are where MuJoCo has them."""
+"""Exported geoms have MuJoCo's poses and sizes."""
 
 import mujoco
 import numpy as np
@@ -9,7 +9,7 @@ from usd_exports import SINGLE, TOLERANCE, exported, matrix, named, world_of, wo
 
 
 def extreme_points(prim: Usd.Prim) -> np.ndarray:
-    """Return points of a shape's surface in its own frame, from its USD attributes: corners, poles, vertices."""
+    """Return corners or poles of a shape in its frame, from its USD attributes."""
     value = lambda key: prim.GetAttribute(key).Get()  # noqa: E731
     corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T.astype(float)
     poles = np.vstack([np.eye(3), -np.eye(3)])
@@ -28,7 +28,7 @@ def extreme_points(prim: Usd.Prim) -> np.ndarray:
 
 
 def mujoco_extremes(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """Return the same points of MuJoCo's geom in the world at `qpos0`, from its own sizes."""
+    """Return the same points of MuJoCo's geom in the world at `qpos0`."""
     state = mujoco.MjData(model)
     mujoco.mj_kinematics(model, state)
     geom, size = model.geom(name), model.geom(name).size
@@ -47,26 +47,26 @@ def mujoco_extremes(model: mujoco.MjModel, name: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["floor", "block", "ball", "tube", "seen", "egg", "rod", "die"])
-def test_shapes_are_where_mujoco_has_them(zoo, name):
+def test_exported_shapes_match_mujoco(zoo, name):
     stage, model = zoo
     prim = named(stage, UsdGeom.Gprim)[name]
     pose = world_pose(prim)
-    found = extreme_points(prim) @ pose[:3, :3].T + pose[:3, 3]
-    np.testing.assert_allclose(found, mujoco_extremes(model, name), atol=1e-14)
+    points = extreme_points(prim) @ pose[:3, :3].T + pose[:3, 3]
+    np.testing.assert_allclose(points, mujoco_extremes(model, name), atol=1e-14)
     low, high = (np.array(corner) for corner in UsdGeom.Boundable(prim).GetExtentAttr().Get())
     np.testing.assert_allclose(low, extreme_points(prim).min(axis=0), rtol=SINGLE)
     np.testing.assert_allclose(high, extreme_points(prim).max(axis=0), rtol=SINGLE)
 
 
-def test_a_plane_without_end_has_no_width(zoo):
+def test_an_infinite_plane_has_no_width(zoo):
     plane = UsdGeom.Plane(named(zoo[0])["endless"])
     assert not plane.GetWidthAttr().IsAuthored()
     assert not plane.GetLengthAttr().IsAuthored()
 
 
-def test_meshes_come_out_at_their_original_place(tmp_path):
+def test_meshes_are_exported_in_their_original_pose(tmp_path):
     points = np.array([[3.0, 1, 2], [7, 1, 2], [3, 4, 2.5], [3.5, 1, 9], [6, 3, 5]]) * 1e-3
-    solid = trimesh.convex.convex_hull(points)  # far from its own origin, so that MuJoCo has to move it
+    solid = trimesh.convex.convex_hull(points)  # far from its origin, so that MuJoCo moves it
     solid.export(tmp_path / "wedge.stl")
     geom = "<body name='a' pos='.1 0 0' quat='.5 .5 -.5 .5'><geom name='g' type='mesh' mesh='wedge' pos='0 .2 0' quat='0 1 0 1'/></body>"
     stage, _ = exported(
@@ -78,12 +78,12 @@ def test_meshes_come_out_at_their_original_place(tmp_path):
     )
     expected = solid.vertices @ placed[:3, :3].T + placed[:3, 3]
     pose = world_pose(mesh.GetPrim())
-    found = np.array(mesh.GetPointsAttr().Get()) @ pose[:3, :3].T + pose[:3, 3]
-    gaps = np.linalg.norm(found[:, None] - expected[None], axis=2)
+    result = np.array(mesh.GetPointsAttr().Get()) @ pose[:3, :3].T + pose[:3, 3]
+    gaps = np.linalg.norm(result[:, None] - expected[None], axis=2)
     assert max(gaps.min(axis=0).max(), gaps.min(axis=1).max()) < TOLERANCE
     assert set(mesh.GetFaceVertexCountsAttr().Get()) == {3}
     faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
-    assert trimesh.Trimesh(found, faces).volume == pytest.approx(solid.volume, rel=1e-4)  # and the faces look outwards
+    assert trimesh.Trimesh(result, faces).volume == pytest.approx(solid.volume, rel=1e-4)  # and faces point outwards
     assert mesh.GetSubdivisionSchemeAttr().Get() == "none"
     assert UsdPhysics.MeshCollisionAPI(mesh.GetPrim()).GetApproximationAttr().Get() == "convexHull"
 

@@ -1,4 +1,4 @@
-"""Joints and drives that are exported: they move as MuJoCo's do."""
+"""Exported joints and drives move like MuJoCo's."""
 
 import mujoco
 import numpy as np
@@ -7,14 +7,14 @@ from pxr import UsdPhysics
 from usd_exports import SINGLE, TOLERANCE, ZOO, exported, mujoco_poses, named, random_qpos, walk, world_of
 
 
-def test_a_walk_over_the_joints_is_mujocos_kinematics(pair):
+def test_poses_from_exported_joints_match_mujoco(pair):
     stage, model = pair
     generator = np.random.default_rng(0)
     states = [model.qpos0, *(random_qpos(model, generator) for _ in range(20))]
     for qpos in states:
         poses = mujoco_poses(model, qpos)
-        for name, found in walk(stage, model, qpos).items():
-            np.testing.assert_allclose(found, poses[name], atol=TOLERANCE, err_msg=name)
+        for name, pose in walk(stage, model, qpos).items():
+            np.testing.assert_allclose(pose, poses[name], atol=TOLERANCE, err_msg=name)
 
 
 @pytest.mark.parametrize("axis", ["1 0 0", "-1 0 0", "0 1 0", "0 0 -1", "-1 1e-7 0", "1e-9 -1 1", "-1 -1 -1"])
@@ -36,17 +36,17 @@ def test_limits(zoo):
     assert limits["spin"] == [-np.inf, np.inf]
 
 
-def test_what_a_joint_does_of_itself(zoo):
+def test_armature_friction_and_damping_are_exported(zoo):
     joints = named(zoo[0], UsdPhysics.Joint)
     keys = ("physxJoint:armature", "physxJoint:jointFriction", "tgdsl:damping")
-    found = {name: [prim.GetAttribute(key).Get() for key in keys] for name, prim in joints.items()}
-    assert found["rail"] == [pytest.approx(0.2), pytest.approx(0.3), None]
-    assert found["elbow"] == [None, None, 0.03]
-    assert found["socket"] == [None, None, 0.1]
-    assert found["spin"] == [None, None, None]
+    values = {name: [prim.GetAttribute(key).Get() for key in keys] for name, prim in joints.items()}
+    assert values["rail"] == [pytest.approx(0.2), pytest.approx(0.3), None]
+    assert values["elbow"] == [None, None, 0.03]
+    assert values["socket"] == [None, None, 0.1]
+    assert values["spin"] == [None, None, None]
 
 
-def test_who_floats_and_who_is_led(zoo):
+def test_free_and_mocap_bodies_have_no_joints(zoo):
     bodies, joints = named(zoo[0], UsdPhysics.RigidBodyAPI), named(zoo[0], UsdPhysics.Joint)
     children = {
         UsdPhysics.Joint(prim).GetBody1Rel().GetTargets()[0].name for prim in zoo[0].Traverse() if prim.IsA(UsdPhysics.Joint)
@@ -67,8 +67,8 @@ GEARED = world_of(
 
 
 @pytest.mark.parametrize("text", [ZOO, GEARED], ids=["direct", "geared"])
-def test_drives_pull_as_mujocos_servos_do(tmp_path, text):
-    """Seen from the joint: the target is the control over the gear; USD counts an angular drive in degrees."""
+def test_drives_exert_the_forces_of_mujocos_servos(tmp_path, text):
+    """At the joint, the target is the control over the gear; USD's angular drives are in degrees."""
     stage, model = exported(tmp_path, text)
     state, generator = mujoco.MjData(model), np.random.default_rng(1)
     joints = named(stage, UsdPhysics.Joint)
@@ -85,12 +85,14 @@ def test_drives_pull_as_mujocos_servos_do(tmp_path, text):
             assert drive.GetTypeAttr().Get() == "force"
             target = state.ctrl[actuator] / gear * unit
             pos, speed = state.qpos[joint.qposadr[0]] * unit, state.qvel[joint.dofadr[0]] * unit
-            own = (joints[joint.name].GetAttribute("tgdsl:damping").Get() or 0) / unit  # in MuJoCo no part of the servo's pull
-            stiffness, damping = drive.GetStiffnessAttr().Get(), drive.GetDampingAttr().Get() - own
+            joint_damping = (
+                joints[joint.name].GetAttribute("tgdsl:damping").Get() or 0
+            ) / unit  # no part of the servo's force in MuJoCo
+            stiffness, damping = drive.GetStiffnessAttr().Get(), drive.GetDampingAttr().Get() - joint_damping
             effort = stiffness * (target - pos) - damping * speed if stiffness else damping * (target - speed)
             limit = drive.GetMaxForceAttr().Get()
-            found = state.qfrc_actuator[joint.dofadr[0]]
-            assert found == pytest.approx(np.clip(effort, -limit, limit), rel=1e-5, abs=1e-6)
+            force = state.qfrc_actuator[joint.dofadr[0]]
+            assert force == pytest.approx(np.clip(effort, -limit, limit), rel=1e-5, abs=1e-6)
 
 
 def test_a_damped_joint_without_a_servo_has_a_drive_that_only_damps(tmp_path):
@@ -106,8 +108,8 @@ def test_a_damped_joint_without_a_servo_has_a_drive_that_only_damps(tmp_path):
 
 def test_ranges_and_names_of_actuators(tmp_path, zoo):
     joints = named(zoo[0], UsdPhysics.Joint)
-    found = {name: [joints[name].GetAttribute(f"tgdsl:{key}").Get() for key in ("actuator", "ctrlrange")] for name in joints}
-    assert found == {"rail": ["push", (-0.1, 0.3)], "elbow": ["bend", None], "socket": [None, None], "spin": ["whirl", None]}
+    values = {name: [joints[name].GetAttribute(f"tgdsl:{key}").Get() for key in ("actuator", "ctrlrange")] for name in joints}
+    assert values == {"rail": ["push", (-0.1, 0.3)], "elbow": ["bend", None], "socket": [None, None], "spin": ["whirl", None]}
     stage, _ = exported(tmp_path, GEARED)
     joints = named(stage, UsdPhysics.Joint)
     assert joints["j"].GetAttribute("tgdsl:ctrlrange").Get() == (-1.5, 0.5)

@@ -1,4 +1,4 @@
-"""Masses through USD and back: whatever the compiler made of a file, its compiled masses are the truth."""
+"""Compiled masses survive USD, whatever the compiler options."""
 
 import mujoco
 import numpy as np
@@ -32,7 +32,7 @@ SCENE = """
   </worldbody>
 </mujoco>
 """
-"""Bodies with and without mass or moments, fixed and moving, whose colliders and visuals are of many groups."""
+"""Bodies with and without mass or moments, fixed and moving, with geoms of many groups."""
 OPTIONS = {
     "none": "",
     "groups": "inertiagrouprange='1 3'",
@@ -52,7 +52,7 @@ EXACT = 1e-14
 
 @pytest.mark.filterwarnings("ignore:.*USD takes a mass of 0", "ignore:.*no ellipsoids", "ignore:.*settotalmass")
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
-def test_each_option_of_the_compiler(tmp_path, options):
+def test_masses_survive_with_each_option_of_the_compiler(tmp_path, options):
     (tmp_path / "robot.xml").write_text(SCENE.format(options=options))
     export_model(tmp_path / "robot.xml", tmp_path / "robot.usda")
     one, two = (load_model(tmp_path / name).compiled for name in ("robot.xml", "robot.usda"))
@@ -79,7 +79,7 @@ TABLE = """<mujoco><compiler inertiagrouprange="1 5"/><worldbody>
 
 
 def test_a_mass_given_in_the_stage_counts(tmp_path):
-    """The table weighs nothing in MuJoCo; who gives it a mass in USD gets that, with the inertia of its collider."""
+    """The table is massless in MuJoCo; a mass set in USD counts, with its collider's inertia."""
     (tmp_path / "robot.xml").write_text(TABLE)
     export_model(tmp_path / "robot.xml", tmp_path / "robot.usda")
     assert load_model(tmp_path / "robot.usda").compiled.body("table").mass[0] == 0
@@ -91,7 +91,7 @@ def test_a_mass_given_in_the_stage_counts(tmp_path):
     np.testing.assert_allclose(np.sort(table.inertia), np.sort([0.0904, 0.0904, 0.18]), rtol=1e-6)
 
 
-def test_numbers_that_are_no_inertia(tmp_path):
+def test_invalid_inertias_are_refused(tmp_path):
     (tmp_path / "robot.xml").write_text(TABLE)
     export_model(tmp_path / "robot.xml", tmp_path / "robot.usda")
     stage = Usd.Stage.Open(str(tmp_path / "robot.usda"))

@@ -1,4 +1,4 @@
-"""Robots out as whole stages: units, bodies, masses, collision filters, names, and what USD cannot hold."""
+"""Whole exported stages: units, bodies, masses, collision filters, names, and what USD cannot hold."""
 
 import sys
 
@@ -50,9 +50,9 @@ def test_masses_and_inertia_tensors(pair):
         axes = mass.GetPrincipalAxesAttr().Get()
         turn = Rotation.from_quat([axes.real, *axes.imaginary], scalar_first=True).as_matrix()
         expected_turn = Rotation.from_quat(body.iquat, scalar_first=True).as_matrix()
-        found = turn @ np.diag(mass.GetDiagonalInertiaAttr().Get()) @ turn.T
+        tensor = turn @ np.diag(mass.GetDiagonalInertiaAttr().Get()) @ turn.T
         expected = expected_turn @ np.diag(body.inertia) @ expected_turn.T
-        np.testing.assert_allclose(found, expected, atol=2 * SINGLE * body.inertia.max(), err_msg=name)
+        np.testing.assert_allclose(tensor, expected, atol=2 * SINGLE * body.inertia.max(), err_msg=name)
 
 
 FAMILY = """<mujoco><worldbody>
@@ -70,7 +70,7 @@ FAMILY = """<mujoco><worldbody>
 
 
 @pytest.mark.parametrize("option", ["", "<option><flag filterparent='disable'/></option>"], ids=["default", "parents_collide"])
-def test_who_can_meet_whom_is_as_in_mujoco(tmp_path, option):
+def test_collision_filters_match_mujoco(tmp_path, option):
     stage, _ = exported(tmp_path, FAMILY.replace("<worldbody>", f"{option}<worldbody>"))
     apart = set()
     for prim in stage.Traverse():
@@ -90,18 +90,18 @@ def test_who_can_meet_whom_is_as_in_mujoco(tmp_path, option):
     assert {p for p in apart if "world" in p} == {frozenset(("world", "link1"))}
 
 
-def test_names_that_are_no_identifiers_and_names_that_meet(tmp_path):
+def test_invalid_and_clashing_names_become_identifiers(tmp_path):
     bodies = "<body name='a/b'><geom name='1st'/></body><body name='a_b'><geom name='a/b'/></body><body name='a b'><geom/><geom/></body>"
     bodies = bodies.replace("<geom", "<geom size='.1'") + "<body name='joints'/><body><geom size='.1'/></body>"
     stage, _ = exported(tmp_path, world_of(bodies))
     root = stage.GetDefaultPrim()
     assert root.GetName() == "MuJoCo_Model"
-    found = {
+    bodies_by_name = {
         child.GetName(): child.GetAttribute("tgdsl:name").Get()
         for child in root.GetChildren()
         if child.HasAPI(UsdPhysics.RigidBodyAPI)
     }
-    assert found == {"a_b": "a/b", "a_b_1": "a_b", "a_b_2": "a b", "joints_1": "joints", "body_5": None}
+    assert bodies_by_name == {"a_b": "a/b", "a_b_1": "a_b", "a_b_2": "a b", "joints_1": "joints", "body_5": None}
     geoms = {
         str(p.GetPath().MakeRelativePath(root.GetPath())): p.GetAttribute("tgdsl:name").Get()
         for p in stage.Traverse()
@@ -117,7 +117,7 @@ def test_names_that_are_no_identifiers_and_names_that_meet(tmp_path):
 
 
 @pytest.mark.parametrize("ending", [".usda", ".usdc", ".usd"])
-def test_same_input_same_bytes(tmp_path, ending):
+def test_export_is_repeatable(tmp_path, ending):
     (tmp_path / "robot.xml").write_text(ZOO)
     contents = []
     for name in ("one", "two", "one"):
@@ -128,8 +128,7 @@ def test_same_input_same_bytes(tmp_path, ending):
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted(["robot.xml", f"one{ending}", f"two{ending}"])
 
 
-def test_usd_finds_no_fault(pair):
-    """USD's own rules for physics, geometry, materials and stages."""
+def test_exported_stages_pass_usds_validators(pair):
     stage, _ = pair
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     assert "usdPhysicsValidators:PhysicsJointChecker" in {validator.GetMetadata().name for validator in validators}
@@ -137,7 +136,7 @@ def test_usd_finds_no_fault(pair):
     assert [error.GetMessage() for error in errors] == []
 
 
-def test_urdf(tmp_path):
+def test_urdf_can_be_exported(tmp_path):
     inertial = "<inertial><mass value='1'/><inertia ixx='.1' iyy='.1' izz='.1' ixy='0' ixz='0' iyz='0'/></inertial>"
     link = "<visual><geometry><box size='.1 .2 .3'/></geometry></visual><collision><geometry><sphere radius='.1'/></geometry></collision>"
     (tmp_path / "arm.urdf").write_text(
@@ -175,7 +174,7 @@ HINGES = "<body name='knot'><joint axis='1 0 0'/><joint axis='0 1 0'/><geom size
     ],
     ids=["joints", "hfield", "ending", "folder"],
 )
-def test_refusals(tmp_path, text, out, message):
+def test_models_that_cannot_be_exported_are_refused(tmp_path, text, out, message):
     (tmp_path / "robot.xml").write_text(text)
     with pytest.raises(RobotError) as caught:
         export_model(tmp_path / "robot.xml", tmp_path / out)
@@ -191,7 +190,7 @@ def test_without_usd_core(tmp_path, monkeypatch):
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     exported(tmp_path, world_of("<geom size='.1'/>"))
-    before = (tmp_path / "robot.usda").read_bytes()
+    old_content = (tmp_path / "robot.usda").read_bytes()
 
     def full(*_):
         raise OSError(28, "No space left on device")
@@ -200,7 +199,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     with pytest.raises(RobotError) as caught:
         export_model(tmp_path / "robot.xml", tmp_path / "robot.usda")
     assert str(caught.value) == f"{tmp_path / 'robot.usda'}: cannot be written: No space left on device"
-    assert (tmp_path / "robot.usda").read_bytes() == before
+    assert (tmp_path / "robot.usda").read_bytes() == old_content
     assert sorted(file.name for file in tmp_path.iterdir()) == ["robot.usda", "robot.xml"]
 
 
@@ -240,7 +239,7 @@ TWO = "<body name='a'><joint name='j' {joint}/><geom size='.1'/></body><body nam
     ],
     ids=["free", "kinds", "springs", "massless", "ellipsoid", "plane"],
 )
-def test_what_is_left_out_is_said(tmp_path, bodies, rest, messages):
+def test_left_out_parts_are_named(tmp_path, bodies, rest, messages):
     (tmp_path / "robot.xml").write_text(world_of(bodies.replace("{joint}", ""), rest))
     with pytest.warns(UserWarning, match="robot.xml: ") as caught:
         export_model(tmp_path / "robot.xml", tmp_path / "robot.usda")

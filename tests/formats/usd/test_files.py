@@ -1,4 +1,4 @@
-"""USD files of every kind, and MJCF files written of them."""
+"""USD files of every kind, and MJCF files written from them."""
 
 import math
 from pathlib import Path
@@ -24,7 +24,7 @@ from tgdsl.formats.usd.reader import usd_to_mjcf
 
 
 @pytest.mark.parametrize("suffix", ["usd", "usda", "usdc", "usdz"])
-def test_every_kind_of_file(tmp_path, suffix):
+def test_every_kind_of_file_is_read(tmp_path, suffix):
     stage = new_stage(tmp_path, "robot.usda" if suffix == "usdz" else f"robot.{suffix}")
     add_body(stage, "/b")
     path = path_of(stage)
@@ -34,7 +34,7 @@ def test_every_kind_of_file(tmp_path, suffix):
     assert load_model(path).bodies == ("world", "b")
 
 
-def test_written_files_are_the_text(tmp_path):
+def test_written_files_give_the_model_of_the_text(tmp_path):
     stage = new_stage(tmp_path)
     add_body(stage, "/b", mass=0)
     add_mesh(stage, "/b/wedge", np.array(WEDGE) / 3, WEDGE_FACES, pos=(0.1, 0.2, 0.3), quat=ODD)
@@ -43,7 +43,7 @@ def test_written_files_are_the_text(tmp_path):
     text = usd_to_mjcf(path_of(stage))
     out = tmp_path / "out" / "hand.xml"
     out.parent.mkdir()
-    for _ in range(2):  # what is there is replaced
+    for _ in range(2):  # existing files are replaced
         write_mjcf(text, out)
         assert sorted(p.relative_to(out.parent).as_posix() for p in out.parent.rglob("*")) == [
             "hand.xml",
@@ -56,7 +56,7 @@ def test_written_files_are_the_text(tmp_path):
         np.testing.assert_array_equal(getattr(inline, name), getattr(written, name), err_msg=name)
 
 
-def test_nothing_half_written_is_left(tmp_path, monkeypatch):
+def test_no_partial_files_are_left(tmp_path, monkeypatch):
     stage = new_stage(tmp_path)
     add_body(stage, "/b")
     add_mesh(stage, "/b/wedge", WEDGE, WEDGE_FACES)
@@ -65,11 +65,11 @@ def test_nothing_half_written_is_left(tmp_path, monkeypatch):
     def full(*_, **__):
         raise OSError("no space left on device")
 
-    before = sorted(tmp_path.iterdir())
+    files_before = sorted(tmp_path.iterdir())
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(OSError, match="no space"):
         write_mjcf(text, tmp_path / "hand.xml")
-    assert sorted(tmp_path.iterdir()) == before
+    assert sorted(tmp_path.iterdir()) == files_before
 
 
 def test_numbers_keep_all_their_digits(tmp_path):

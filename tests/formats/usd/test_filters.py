@@ -1,4 +1,4 @@
-"""Who collides with whom: filters are of what they name, not of what is nested below."""
+"""Collision filters apply to the prims that they name, not to bodies nested below."""
 
 import pytest
 from pxr import UsdGeom, UsdPhysics
@@ -7,7 +7,7 @@ from stages import add_body, add_joint, add_shape, compiled, error_of, meetings,
 
 
 def nested(folder, count=6):
-    """Return a stage with bodies nested in each other, all in one place; `/b0/b1/b2` and so on, and their paths."""
+    """Return a stage with nested bodies `/b0/b1/b2`… in one place, and their paths."""
     stage, paths = new_stage(folder), [""]
     for i in range(count):
         paths.append(f"{paths[-1]}/b{i}")
@@ -24,7 +24,7 @@ def keep_apart(stage, source, *targets):
     UsdPhysics.FilteredPairsAPI.Apply(stage.GetPrimAtPath(source)).CreateFilteredPairsRel().SetTargets(list(targets))
 
 
-def test_a_bodys_filter_is_not_that_of_bodies_nested_below(tmp_path):
+def test_a_bodys_filter_excludes_bodies_nested_below(tmp_path):
     stage, paths = nested(tmp_path)
     keep_apart(stage, paths[0], paths[2], paths[4])
     model = compiled(stage)
@@ -41,14 +41,14 @@ def test_a_body_owns_colliders_below_scopes(tmp_path):
     assert meetings(compiled(stage)) == {("b0", "b1"), ("b0", "c")}
 
 
-def test_a_colliders_filter_is_that_of_the_collider(tmp_path):
+def test_a_filter_may_name_colliders(tmp_path):
     stage, paths = nested(tmp_path, 3)
     keep_apart(stage, f"{paths[0]}/box0", f"{paths[1]}/box1")
     assert meetings(compiled(stage)) == everyone(3) - {("b0", "b1")}
 
 
-def test_an_articulations_filter_is_that_of_all_its_bodies(tmp_path):
-    """The root is no body: it stands for the bodies below it and those that joints connect with them."""
+def test_an_articulations_filter_covers_all_its_bodies(tmp_path):
+    """The root is no body: it represents the bodies below it and those connected to them."""
     stage = new_stage(tmp_path)
     root = UsdGeom.Xform.Define(stage, "/robot").GetPrim()
     UsdPhysics.ArticulationRootAPI.Apply(root)
@@ -60,7 +60,7 @@ def test_an_articulations_filter_is_that_of_all_its_bodies(tmp_path):
     assert meetings(compiled(stage)) == {("b0", "b1"), ("b0", "b2"), ("b1", "b2")}
 
 
-def test_a_root_that_is_a_body_is_that_body(tmp_path):
+def test_the_filter_of_a_root_that_is_a_body_covers_that_body(tmp_path):
     stage, paths = nested(tmp_path, 3)
     UsdPhysics.ArticulationRootAPI.Apply(stage.GetPrimAtPath(paths[0]))
     keep_apart(stage, paths[0], paths[2])
@@ -68,7 +68,7 @@ def test_a_root_that_is_a_body_is_that_body(tmp_path):
 
 
 @pytest.mark.parametrize("side", ["source", "target"])
-def test_other_prims_are_named(tmp_path, side):
+def test_filters_of_other_prims_are_dropped_with_a_warning(tmp_path, side):
     stage, paths = nested(tmp_path, 3)
     UsdGeom.Scope.Define(stage, f"{paths[1]}/visuals")
     ends = (f"{paths[1]}/visuals", paths[0])
@@ -79,7 +79,7 @@ def test_other_prims_are_named(tmp_path, side):
     assert meetings(model) == everyone(3)
 
 
-def test_a_filter_of_what_is_not_there_is_an_error(tmp_path):
+def test_a_filter_of_a_missing_prim_is_refused(tmp_path):
     stage, paths = nested(tmp_path, 1)
     keep_apart(stage, paths[0], "/gone")
     assert error_of(stage) == "/b0: physics:filteredPairs names /gone, which does not exist"
@@ -100,7 +100,7 @@ def test_articulations_without_self_collision(tmp_path, name):
 
 
 def palm(folder, is_mujocos, **values):
-    """Return a palm that is fixed to the world, a thumb on it, a shell that is welded to the thumb, and a tip on the shell."""
+    """Return a palm fixed to the world, its thumb, a shell welded to the thumb, and a tip on the shell."""
     stage = new_stage(folder)
     if is_mujocos:
         apply(UsdPhysics.Scene.Define(stage, "/scene").GetPrim(), "MjcSceneAPI")
@@ -114,8 +114,8 @@ def palm(folder, is_mujocos, **values):
     return stage
 
 
-def test_mujocos_scene_filters_parents_as_mujoco_does(tmp_path):
-    """UsdPhysics keeps apart what a joint joins. MuJoCo sees welded bodies as one, and lets all meet what does not move."""
+def test_mujocos_scene_filters_parents_like_mujoco(tmp_path):
+    """UsdPhysics filters jointed bodies. MuJoCo merges welded bodies, and lets everything touch fixed ones."""
     assert meetings(compiled(palm(tmp_path, False))) >= {("palm", "shell"), ("palm", "tip")}
     stage = palm(tmp_path, True)
     assert meetings(compiled(stage)) == {("palm", "thumb"), ("palm", "shell"), ("palm", "tip")}
@@ -129,8 +129,8 @@ def test_mujocos_scene_filters_parents_as_mujoco_does(tmp_path):
     }
 
 
-def test_a_joint_that_says_so_itself_overrules_mujocos_scene(tmp_path):
-    """With one joint whose bodies collide, MuJoCo's filter is off; whom else it would have kept apart is listed."""
+def test_a_joints_collision_flag_overrides_mujocos_scene(tmp_path):
+    """If one joint's bodies collide, MuJoCo's filter is off; other filtered pairs are listed."""
     stage = palm(tmp_path, True, collisionEnabled=True)
     assert ("shell", "tip") in meetings(compiled(stage))
     add_body(stage, "/nail")

@@ -40,11 +40,11 @@ from tgdsl.formats.usd.reader import usd_to_mjcf
 
 ELL = [(x, y, z) for z in (0, 1) for x, y in ((0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2))]
 ELL_FACES = [(5, 4, 3, 2, 1, 0), (6, 7, 8, 9, 10, 11), *((i, (i + 1) % 6, (i + 1) % 6 + 6, i + 6) for i in range(6))]
-"""A prism over an L."""
+"""An L-shaped prism."""
 
 
-def test_centimetres_and_y_up_are_metres_and_z_up(tmp_path):
-    """The same robot in both, the one turned by the up-axis and 100 times as large in its own units."""
+def test_centimetres_and_y_up_convert_to_metres_and_z_up(tmp_path):
+    """The same robot with either up-axis, in metres and in centimetres."""
     models = []
     upright = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # Z-up from Y-up
     for metres, up in ((1.0, "Z"), (0.01, "Y")):
@@ -97,19 +97,19 @@ SHAPES = [
 @pytest.mark.parametrize("axis", "XYZ")
 @pytest.mark.parametrize(("kind", "values", "scale", "shape", "size", "volume"), SHAPES)
 def test_shapes(tmp_path, kind, values, scale, shape, size, volume, axis):
-    """Type, size, place, volume and inertia of every shape, turned and scaled; MuJoCo computes the inertia of its own."""
+    """Type, size, pose, volume and inertia of every shape, rotated and scaled, against MuJoCo's inertia."""
     stage = new_stage(tmp_path)
     add_body(stage, "/b", mass=0)
     scale = np.array(scale, dtype=float)
     if "height" in values:
         values = {**values, "axis": axis}
-        scale = np.roll(scale, "XYZ".index(axis) + 1)  # the last one is along the axis
+        scale = np.roll(scale, "XYZ".index(axis) + 1)  # the last scale is along the axis
     elif axis != "Z":
         return
     add_shape(stage, "/b/shape", kind, (0.1, 0.2, 0.3), ODD, scale.tolist(), **values)
     text = usd_to_mjcf(path_of(stage))
     model = mujoco.MjModel.from_xml_string(text)
-    own = inertia(model, "b")
+    tensor = inertia(model, "b")
     close(model.body("b").mass, 1000 * volume, 5e-3 if shape in ("mesh", "ball") else TOLERANCE)
     geom = load_model(path_of(stage)).geoms[0]
     assert geom.shape == ("mesh" if shape == "ball" else shape)
@@ -118,7 +118,7 @@ def test_shapes(tmp_path, kind, values, scale, shape, size, volume, axis):
     for mesh in root.iter("mesh"):
         mesh.set("inertia", "exact")
     bare = mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
-    np.testing.assert_allclose(own, inertia(bare, "b"), rtol=1e-5, atol=1e-5 * np.abs(own).max())
+    np.testing.assert_allclose(tensor, inertia(bare, "b"), rtol=1e-5, atol=1e-5 * np.abs(tensor).max())
     close(model.body("b").ipos, bare.body("b").ipos, 1e-5)
     if size:
         close(geom.size[: len(size)], size)
@@ -127,7 +127,7 @@ def test_shapes(tmp_path, kind, values, scale, shape, size, volume, axis):
     surface = load_model(path_of(stage)).surface((geom,))
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     assert mesh.is_watertight
-    np.testing.assert_allclose(mesh.volume, volume, rtol=5e-3)  # and outwards
+    np.testing.assert_allclose(mesh.volume, volume, rtol=5e-3)  # and faces point outwards
     local = (mesh.vertices - [0.1, 0.2, 0.3]) @ matrix((0, 0, 0), ODD)[:3, :3] / scale
     height = values["height"] + (2 * values["radius"] if kind is UsdGeom.Capsule else 0)
     along = "XYZ".index(axis)
@@ -139,7 +139,7 @@ def test_shapes(tmp_path, kind, values, scale, shape, size, volume, axis):
 
 
 def test_shear(tmp_path):
-    """A turned shape under a scaled parent: a sphere stays an ellipsoid, a cube becomes a mesh, a body is refused."""
+    """A rotated shape under a scaled parent: a sphere becomes an ellipsoid, a cube a mesh; a body is refused."""
     stage = new_stage(tmp_path)
     add_body(stage, "/b", mass=0)
     placed(UsdGeom.Xform.Define(stage, "/b/stretched").GetPrim(), scale=(1, 2, 3))
@@ -162,7 +162,7 @@ def test_shear(tmp_path):
 
 @pytest.mark.parametrize("scale", [(1, 1, 1), (2, 0.5, 3), (-1, 2, 1)])
 @pytest.mark.parametrize("orientation", ["rightHanded", "leftHanded"])
-def test_meshes_come_out_at_their_place_and_the_right_way_round(tmp_path, scale, orientation):
+def test_meshes_keep_their_pose_and_orientation(tmp_path, scale, orientation):
     stage = new_stage(tmp_path, metres=0.01)
     add_body(stage, "/b", mass=0)
     faces = [face[::-1] for face in WEDGE_FACES] if orientation == "leftHanded" else WEDGE_FACES
@@ -177,8 +177,8 @@ def test_meshes_come_out_at_their_place_and_the_right_way_round(tmp_path, scale,
     np.testing.assert_allclose(model.compiled.body("b").mass, 1000 * volume, rtol=1e-6)
 
 
-def test_polygons_convex_or_not_are_cut_into_triangles(tmp_path):
-    """A prism over an L: its volume and area only come out if no triangle lies outside the polygon."""
+def test_concave_polygons_are_triangulated(tmp_path):
+    """Volume and area of an L-shaped prism are right only if no triangle lies outside the polygon."""
     stage = new_stage(tmp_path)
     add_body(stage, "/b")
     add_mesh(stage, "/b/ell", ELL, ELL_FACES, collides=False, quat=ODD)
@@ -193,8 +193,8 @@ def test_polygons_convex_or_not_are_cut_into_triangles(tmp_path):
 
 
 @pytest.mark.parametrize("first", range(16))
-def test_polygons_with_many_reflex_corners(tmp_path, first):
-    """A comb with four teeth, its corners counted from anywhere, seen from either side."""
+def test_polygons_with_many_reflex_corners_are_triangulated(tmp_path, first):
+    """A comb with four teeth, from any first corner and either side."""
     teeth = [corner for x in (6, 4, 2, 0) for corner in ((x + 1, 3), (x, 3), (x, 1), (x - 1, 1))][:-2]
     comb = [(0, 0), (7, 0), *teeth]
     ring = np.roll(np.array([(x, y, 0.5 * x) for x, y in comb], dtype=float), first, axis=0)
@@ -215,7 +215,7 @@ def test_approximations(tmp_path):
     kinds = ("none", "convexHull", "boundingCube", "boundingSphere", "convexDecomposition", "meshSimplification", "sdf")
     for i, kind in enumerate(kinds):
         add_mesh(stage, f"/b/{kind}", ELL, ELL_FACES, kind, pos=(0, 0, 10 * i), scale=(1, 1, 2))
-    add_mesh(stage, "/b/wedge", WEDGE, WEDGE_FACES, "none")  # convex: nothing is lost
+    add_mesh(stage, "/b/wedge", WEDGE, WEDGE_FACES, "none")  # convex: the hull is exact
     model, messages = warned(stage)
     hulls = ("none", "convexDecomposition", "meshSimplification", "sdf")
     assert messages == [f'meshes with approximation "{kind}" collide as their convex hulls: /b/{kind}' for kind in hulls]
@@ -230,7 +230,7 @@ def test_approximations(tmp_path):
     assert model.nmesh == 2  # equal meshes are kept once
 
 
-def test_instances_give_all_their_geoms(tmp_path):
+def test_instances_have_all_their_geoms(tmp_path):
     part = new_stage(tmp_path, "part.usda")
     part.SetDefaultPrim(UsdGeom.Xform.Define(part, "/part").GetPrim())
     add_shape(part, "/part/box", pos=(0, 0, 1))
@@ -256,8 +256,8 @@ def test_instances_give_all_their_geoms(tmp_path):
         close(model.compiled.body(body).ipos, [0, 0, 1])
 
 
-def test_a_whole_robot_as_an_instance(tmp_path):
-    """Joints inside an instance name bodies inside the prototype: they are the instance's."""
+def test_a_whole_robot_can_be_an_instance(tmp_path):
+    """Joints inside an instance name the prototype's bodies, but connect the instance's."""
     part = new_stage(tmp_path, "part.usda")
     part.SetDefaultPrim(UsdGeom.Xform.Define(part, "/part").GetPrim())
     for i in range(2):
@@ -285,7 +285,7 @@ def test_names(tmp_path):
     call(add_shape(stage, "/hand/palm/skin"), "pad")
     double = add_body(stage, "/hand/back")
     call(double, "right/palm")
-    add_body(stage, "/hand/index/tip/nested", (1, 0, 0))  # a body in a body moves on its own
+    add_body(stage, "/hand/index/tip/nested", (1, 0, 0))  # a nested body moves separately
     add_shape(stage, "/hand/index/tip/nested/nail")
     model, messages = warned(stage)
     assert messages == ["duplicate names in tgdsl:name were dropped: /hand/back"]
@@ -301,7 +301,7 @@ def test_names(tmp_path):
     assert parents(model)["nested"] == "world"
 
 
-def test_what_is_seen_and_what_collides(tmp_path):
+def test_purpose_and_visibility_set_groups_of_geoms(tmp_path):
     stage = new_stage(tmp_path)
     add_body(stage, "/b")
     for name, purpose, collides in product("v", ("default", "render", "guide", "proxy"), (True, False)):

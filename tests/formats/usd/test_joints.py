@@ -1,4 +1,4 @@
-"""Joints of USD stages: poses against products of USD's own joint frames."""
+"""Joints of USD stages: poses against products of USD's joint frames."""
 
 import math
 
@@ -34,7 +34,7 @@ from stages import (
 @pytest.mark.parametrize("is_swapped", [False, True], ids=["straight", "swapped"])
 @pytest.mark.parametrize("axis", "XYZ")
 @pytest.mark.parametrize("kind", ["hinge", "slide"])
-def test_links_move_as_the_joint_frames_say(tmp_path, kind, axis, is_swapped):
+def test_links_move_by_their_joint_frames(tmp_path, kind, axis, is_swapped):
     stage = new_stage(tmp_path)
     arm(stage, kind, axis, is_swapped)
     model = compiled(stage)
@@ -66,14 +66,14 @@ def test_ball_joints(tmp_path, is_swapped):
 
 @pytest.mark.parametrize("is_swapped", [False, True], ids=["straight", "swapped"])
 @pytest.mark.parametrize(("kind", "axis"), [("hinge", "Y"), ("slide", "Z"), ("ball", "")])
-def test_authored_poses_that_are_not_zero_are_a_keyframe(tmp_path, kind, axis, is_swapped):
+def test_authored_poses_become_a_keyframe(tmp_path, kind, axis, is_swapped):
     stage = new_stage(tmp_path)
     arm(stage, kind, axis, is_swapped)
     motion = {"hinge": turn("Y", -0.6), "slide": shift("Z", 0.4), "ball": matrix((0, 0, 0), (0.9, 0.2, 0.1, -0.3))}[kind]
     one_in_zero = FRAME0 @ motion @ np.linalg.inv(FRAME1)
     pose = matrix((0.1, 0.2, 0.3), OTHER) @ (np.linalg.inv(one_in_zero) if is_swapped else one_in_zero)
     move(stage.GetPrimAtPath("/robot/link"), pose)
-    add_body(stage, "/robot/loose", (3, 2, 1), ODD)  # a free joint takes its place in the keyframe too
+    add_body(stage, "/robot/loose", (3, 2, 1), ODD)  # a free joint is in the keyframe too
     model = compiled(stage)
     close(world_pose(model, "link", key="authored"), pose)
     close(world_pose(model, "loose", key="authored"), matrix((3, 2, 1), ODD))
@@ -89,7 +89,7 @@ def test_authored_angles_beyond_half_a_turn_are_within_the_limits(tmp_path):
     close(compiled(stage).key("authored").qpos, [math.radians(200)])
 
 
-def test_a_joint_whose_frames_do_not_meet_is_told(tmp_path):
+def test_a_joint_whose_frames_do_not_meet_is_named(tmp_path):
     stage = new_stage(tmp_path)
     arm(stage, "hinge", "X")
     stage.GetPrimAtPath("/robot/link").GetAttribute("xformOp:translate").Set(Gf.Vec3d(5, 5, 5))
@@ -117,7 +117,7 @@ def test_limits(tmp_path, kind, values, expected):
         close(model.jnt_range[0], expected)
 
 
-def test_limits_that_leave_no_room_are_a_weld_there(tmp_path):
+def test_equal_limits_become_a_weld(tmp_path):
     stage = new_stage(tmp_path)
     arm(stage, "hinge", "X", lowerLimit=30.0, upperLimit=30.0)
     with pytest.warns(UserWarning, match="do not meet"):  # the link is authored at zero
@@ -151,7 +151,7 @@ def test_scaled_bodies(tmp_path):
     close(box.pos, 0.1 * scale)
 
 
-def test_gains_are_per_degree_and_in_the_units_of_the_stage(tmp_path):
+def test_gains_are_per_degree_in_units_of_the_stage(tmp_path):
     for metres, kilograms in ((1.0, 1.0), (0.01, 0.001)):
         stage = new_stage(tmp_path, f"robot{metres}.usda", metres)
         UsdPhysics.SetStageKilogramsPerUnit(stage, kilograms)
@@ -186,7 +186,7 @@ def test_gains_are_per_degree_and_in_the_units_of_the_stage(tmp_path):
         close(model.dof_frictionloss[model.joint("turn").dofadr[0]], 0.125 * angular)
 
 
-def test_generic_joints_that_are_one_of_mujocos(tmp_path):
+def test_generic_joints_with_a_mujoco_type_are_read(tmp_path):
     locked = dict.fromkeys(GENERIC, (1.0, -1.0))
     cases = {
         "hinge": (locked | {"rotZ": (-30.0, 60.0)}, mujoco.mjtJoint.mjJNT_HINGE, "Z"),

@@ -1,4 +1,4 @@
-"""Masses against closed forms and usd-core's own, materials, filters and gravity of USD stages."""
+"""Masses of USD stages against closed forms and usd-core; materials, filters and gravity."""
 
 import math
 
@@ -44,7 +44,7 @@ from stages import (
         ({}, {"Mass": 7, "DiagonalInertia": (1, 2, 2.5)}, 0, 8007),
     ],
 )
-def test_mass_is_what_usd_core_makes_of_it(tmp_path, body, collider, material, expected):
+def test_masses_match_usd_core(tmp_path, body, collider, material, expected):
     stage = new_stage(tmp_path)
     prim = add_body(stage, "/b", (1, 2, 3), ODD, mass=0)
     boxes = {"/b/one": (1.0, 0.0, 0.0), "/b/two": (-2.0, 0.0, 0.5)}
@@ -66,12 +66,12 @@ def test_mass_is_what_usd_core_makes_of_it(tmp_path, body, collider, material, e
         return found
 
     mass, moments, centre, axes = UsdPhysics.RigidBodyAPI(prim).ComputeMassProperties(box)
-    turned = Rotation.from_quat([axes.GetReal(), *axes.GetImaginary()], scalar_first=True).as_matrix()
+    rotation = Rotation.from_quat([axes.GetReal(), *axes.GetImaginary()], scalar_first=True).as_matrix()
     model = compiled(stage)
     close(model.body("b").mass, expected)
     close(mass, expected)
     close(model.body("b").ipos, centre)
-    np.testing.assert_allclose(inertia(model, "b"), turned @ np.diag(moments) @ turned.T, atol=1e-5 * max(moments))
+    np.testing.assert_allclose(inertia(model, "b"), rotation @ np.diag(moments) @ rotation.T, atol=1e-5 * max(moments))
 
 
 def test_authored_inertia(tmp_path):
@@ -85,7 +85,7 @@ def test_authored_inertia(tmp_path):
     close(inertia(model, "b"), axes @ np.diag([0.02, 0.03, 0.04]) @ axes.T)
 
 
-def test_inertias_that_are_none_and_masses_without_inertia(tmp_path):
+def test_impossible_and_missing_inertias_are_repaired(tmp_path):
     stage = new_stage(tmp_path)
     UsdPhysics.MassAPI(add_body(stage, "/long")).CreateDiagonalInertiaAttr((0.01, 0.01, 0.1))
     UsdPhysics.MassAPI(add_body(stage, "/disc")).CreateDiagonalInertiaAttr(
@@ -126,7 +126,7 @@ def test_friction_of_materials(tmp_path):
 
 
 def crowd(stage: Usd.Stage, *names: str) -> None:
-    """Add boxes at one place: all collide with all."""
+    """Add overlapping boxes, all of which collide."""
     for i, name in enumerate(names):
         add_body(stage, f"/{name}", (0.01 * i, 0, 0))
         add_shape(stage, f"/{name}/{name}_box")
@@ -187,7 +187,7 @@ def test_gravity(tmp_path, direction, magnitude, expected, up):
     close(compiled(stage).opt.gravity, expected)
 
 
-def test_what_is_dropped_is_told_once(tmp_path):
+def test_dropped_properties_are_named_once(tmp_path):
     stage = new_stage(tmp_path)
     chain(stage, 3, breakForce=10.0)
     drive = UsdPhysics.DriveAPI.Apply(stage.GetPrimAtPath("/j1"), "angular")

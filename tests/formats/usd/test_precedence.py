@@ -1,4 +1,4 @@
-"""Several schemas say the same: the most specific counts, and who contradicts it is named."""
+"""If several schemas give a value, the most specific one counts and contradictions are named."""
 
 import math
 
@@ -58,7 +58,7 @@ def test_sources_that_agree_are_silent(tmp_path):
     assert (model.opt.timestep, turn("dof_damping")(model)) == (0.003, 0.3)
 
 
-def test_a_materials_stiffness_is_that_of_its_colliders_solref(tmp_path):
+def test_a_colliders_solref_overrides_its_materials_stiffness(tmp_path):
     stage = schema_stage(tmp_path)
     author(stage.GetPrimAtPath("/rubber"), "newton:contactStiffness", 2500.0)
     author(stage.GetPrimAtPath("/link/ball"), "mjc:solref", REF)

@@ -1,4 +1,4 @@
-"""Out as USD and in again: MuJoCo makes of the stage what it made of the robot file."""
+"""Round trips through USD: the stage compiles to the model of the robot file."""
 
 from pathlib import Path
 
@@ -55,7 +55,7 @@ SHAPES = """
 
 @pytest.fixture(scope="module", params=["shapes", "hand"])
 def pair(request, tmp_path_factory) -> tuple[mujoco.MjModel, mujoco.MjModel]:
-    """A model, and what it comes back as."""
+    """Return a model before and after the round trip."""
     folder = tmp_path_factory.mktemp(request.param)
     file = XHAND1
     if request.param == "shapes":
@@ -98,15 +98,15 @@ def test_joints(pair):
             np.testing.assert_allclose(getattr(second, key), getattr(first, key), rtol=TOLERANCE)
 
 
-def test_the_same_positions_give_the_same_places(pair):
-    """Bodies to 1e-6 m, and geoms: box corners, spheres' centres, the vertices of meshes."""
+def test_the_same_joint_positions_give_the_same_poses(pair):
+    """Poses of bodies, and points of geoms: ends of axes and vertices of meshes."""
     generator = np.random.default_rng(0)
     for _ in range(20):
         states = [mujoco.MjData(model) for model in pair]
         for joint in names(pair[0], "joint"):
-            found = pair[0].joint(joint)
-            value = generator.uniform(*(found.range if found.limited[0] else (-3, 3)), size=1)
-            if found.type[0] == mujoco.mjtJoint.mjJNT_BALL:
+            joint_model = pair[0].joint(joint)
+            value = generator.uniform(*(joint_model.range if joint_model.limited[0] else (-3, 3)), size=1)
+            if joint_model.type[0] == mujoco.mjtJoint.mjJNT_BALL:
                 value = generator.normal(size=4)
             for state in states:
                 state.joint(joint).qpos[:] = value
@@ -116,8 +116,8 @@ def test_the_same_positions_give_the_same_places(pair):
             np.testing.assert_allclose(states[1].body(body).xpos, states[0].body(body).xpos, atol=TOLERANCE, err_msg=body)
             np.testing.assert_allclose(states[1].body(body).xmat, states[0].body(body).xmat, atol=TOLERANCE, err_msg=body)
         for geom in names(pair[0], "geom"):
-            places = [points(model, state, geom) for model, state in zip(pair, states, strict=True)]
-            np.testing.assert_allclose(places[1], places[0], atol=TOLERANCE, err_msg=geom)
+            positions = [points(model, state, geom) for model, state in zip(pair, states, strict=True)]
+            np.testing.assert_allclose(positions[1], positions[0], atol=TOLERANCE, err_msg=geom)
 
 
 def points(model: mujoco.MjModel, state: mujoco.MjData, name: str) -> np.ndarray:
@@ -128,7 +128,7 @@ def points(model: mujoco.MjModel, state: mujoco.MjData, name: str) -> np.ndarray
         mesh = model.mesh(geom.dataid[0])
         local = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]]
     elif geom.type[0] == mujoco.mjtGeom.mjGEOM_PLANE:
-        local[2] = 0  # the third size of a plane is how densely its grid is drawn
+        local[2] = 0  # a plane's third size is the spacing of its drawn grid
     return local @ state.geom(name).xmat.reshape(3, 3).T + state.geom(name).xpos
 
 
@@ -142,13 +142,13 @@ def test_geoms_keep_their_kind_size_group_friction_and_colour(pair):
         np.testing.assert_allclose(second.rgba, first.rgba, rtol=TOLERANCE)
 
 
-def test_who_must_not_collide(pair):
-    """Those that the first model excludes, and those that it leaves out by itself, are all left out by the second."""
-    both = []
+def test_exclusions_are_kept(pair):
+    """The second model excludes at least the pairs of the first."""
+    exclusions = []
     for model in pair:
         signatures = model.exclude_signature.tolist()
-        both.append({frozenset((model.body(s >> 16).name, model.body(s & 0xFFFF).name)) for s in signatures})
-    assert both[0] <= both[1]
+        exclusions.append({frozenset((model.body(s >> 16).name, model.body(s & 0xFFFF).name)) for s in signatures})
+    assert exclusions[0] <= exclusions[1]
 
 
 WELDED = """
@@ -161,7 +161,7 @@ WELDED = """
 
 @pytest.mark.parametrize("pairs", [(), (("pad", "plate"),)])
 def test_no_exclusions_are_added(tmp_path, pairs):
-    """USD's physics needs them for what MuJoCo never collides by itself; the model that comes back has only its own."""
+    """USD needs exclusions for pairs that MuJoCo never collides; they are removed on the way back."""
     contact = "".join(f'<exclude body1="{one}" body2="{two}"/>' for one, two in pairs)
     (tmp_path / "robot.xml").write_text(WELDED.format(contact=f"<contact>{contact}</contact>"))
     export_model(tmp_path / "robot.xml", tmp_path / "robot.usda")
@@ -175,7 +175,7 @@ def test_no_exclusions_are_added(tmp_path, pairs):
 
 @pytest.mark.parametrize("of_joint", ["", "-10 10", "-10 4", "-300 300"])
 @pytest.mark.parametrize("of_actuator", ["", "-200 200", "-5 5"])
-def test_force_limits_of_joint_and_actuator_stay_apart(tmp_path, of_joint, of_actuator):
+def test_force_limits_of_joint_and_actuator_stay_separate(tmp_path, of_joint, of_actuator):
     limits = [f'{key}="{text}"' if text else "" for key, text in (("actuatorfrcrange", of_joint), ("forcerange", of_actuator))]
     body = f'<body><joint name="j" axis="0 1 0" {limits[0]}/><geom size=".01"/></body>'
     actuator = f'<actuator><position joint="j" kp="5" gear="2" {limits[1]}/></actuator>'
@@ -187,7 +187,7 @@ def test_force_limits_of_joint_and_actuator_stay_apart(tmp_path, of_joint, of_ac
 
 
 def test_the_time_step_is_written_even_if_it_is_mujocos_default(tmp_path):
-    """A schema that another program applies to the scene has another default."""
+    """Another program's schema on the scene may have another default."""
     (tmp_path / "robot.xml").write_text(WELDED.format(contact=""))
     export_model(tmp_path / "robot.xml", tmp_path / "robot.usda")
     stage = Usd.Stage.Open(str(tmp_path / "robot.usda"))
@@ -197,14 +197,18 @@ def test_the_time_step_is_written_even_if_it_is_mujocos_default(tmp_path):
 
 
 def test_servos(pair):
-    """The joint's own damping comes back with the drive's: together they are what they were."""
+    """The joint's damping returns as part of the drive's; their sum is unchanged."""
     first, second = ({model.joint(model.actuator_trnid[i, 0]).name: i for i in range(model.nu)} for model in pair)
     assert first.keys() == second.keys()
     for name, actuator in first.items():
-        there, back = second[name], pair[1]
-        np.testing.assert_allclose(back.actuator_biasprm[there, 1], pair[0].actuator_biasprm[actuator, 1], rtol=TOLERANCE)
-        np.testing.assert_allclose(back.actuator_forcerange[there], pair[0].actuator_forcerange[actuator], rtol=TOLERANCE)
-        dampings = [m.joint(name).damping[0] - m.actuator_biasprm[i, 2] for m, i in zip(pair, (actuator, there), strict=True)]
+        index, second_model = second[name], pair[1]
+        np.testing.assert_allclose(
+            second_model.actuator_biasprm[index, 1], pair[0].actuator_biasprm[actuator, 1], rtol=TOLERANCE
+        )
+        np.testing.assert_allclose(
+            second_model.actuator_forcerange[index], pair[0].actuator_forcerange[actuator], rtol=TOLERANCE
+        )
+        dampings = [m.joint(name).damping[0] - m.actuator_biasprm[i, 2] for m, i in zip(pair, (actuator, index), strict=True)]
         np.testing.assert_allclose(dampings[1], dampings[0], rtol=TOLERANCE)
 
 
