@@ -1,1 +1,1 @@
-"""What the package computes against closed forms of mechanics, heat and statistics: one file per field."""
+"""The package's results against closed forms of mechanics, heat and statistics: one file per field."""

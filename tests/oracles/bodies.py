@@ -1,4 +1,4 @@
-"""What whole bodies and single bits read: the weight on a link, and a contact's threshold and release."""
+"""Readings of whole bodies and single bits: the weight on a link, and a contact's threshold and release."""
 
 import numpy as np
 

@@ -1,6 +1,6 @@
-"""Comparisons with closed forms: what a decorated function returns, with its name, equation, source, unit and tolerance.
+"""Comparisons with closed forms: results of decorated functions with name, equation, source, unit and tolerance.
 
-Shapes: `point` places, times or cases; `series` curves over the same abscissa.
+Shapes: `point` positions, times or cases; `series` curves over the same abscissa.
 """
 
 import inspect
@@ -15,25 +15,25 @@ import torch
 
 
 class Values(NamedTuple):
-    """What a comparison computes; below `paper` what depends on its arguments and so cannot be in the decorator."""
+    """Values of a comparison; fields below `paper` depend on its arguments, so they cannot be in the decorator."""
 
     exact: Any
     """Known values: (point,), (series, point), or a number; all three are broadcast against each other."""
     ours: Any
-    """The same computed by tgdsl."""
+    """tgdsl's values."""
     paper: Any = None
-    """The same by the paper's formula, if it differs."""
+    """Values by the paper's formula, if it differs."""
     at: Any = None
     """Abscissa: numbers, or labels."""
     rtol: float | None = None
     atol: float | None = None
     words: Mapping[str, Any] = {}
-    """More words for the name."""
+    """Suffix of the name."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A quantity as tgdsl computes it beside its known value; see `oracle` for the fields."""
+    """A quantity computed by tgdsl and its known value; see `oracle` for the fields."""
 
     name: str
     equation: str
@@ -70,7 +70,7 @@ class Comparison:
 
     @property
     def used(self) -> float:
-        """The largest share of the tolerance that an error uses; up to 1 the comparison holds."""
+        """The largest error over its tolerance; the comparison holds up to 1."""
         allowed = self.atol + self.rtol * np.abs(self.exact)
         off = np.abs(self.ours - self.exact)
         return _largest(np.divide(off, allowed, out=np.where(off == 0, 0.0, np.inf), where=allowed > 0))
@@ -86,7 +86,7 @@ def _largest(values: np.ndarray) -> float:
 
 
 class Case(NamedTuple):
-    """A registered function with its arguments; the report has a row of it if `is_reported`, tests check all."""
+    """A registered function with its arguments; the report shows it if `is_reported`, tests check all."""
 
     name: str
     section: str
@@ -99,7 +99,7 @@ CASES: list[Case] = []
 
 
 def cases_of(section: str, function: Callable, each: Iterable, also: Iterable, slow: bool | Iterable = False) -> list[Case]:
-    """Return the cases of a function: each row of the report, and what tests check in addition."""
+    """Return the cases of a function: rows of the report, and those that only tests check."""
     rows, more, slow_rows = (
         [row if isinstance(row, tuple) else (row,) for row in arguments]
         for arguments in (each, also, () if isinstance(slow, bool) else slow)
@@ -132,11 +132,11 @@ def oracle(
 ) -> Callable[[Callable], Callable[..., Comparison]]:  # fmt: skip
     """Register a function that returns `(exact, ours)`, `(exact, ours, paper)` or `Values`, and let it return a `Comparison`.
 
-    `name`, `equation` (of the exact value), `source` and labels may contain the function's arguments in braces, as
-    `str.format` has them; in float32 the name says so. `quantity` and `over`, the abscissa, end in their unit in brackets;
-    without a unit, `at` are labels. An error may be `atol + rtol·|exact|`; `of_peak` is `atol` over the largest exact value.
-    `series` names curves, `defects` the findings of `oracles.defects` that it answers. `each` are arguments of the rows
-    of the report, tuples or single ones, `also` those of more tests; `slow` those whose tests are slow, or all (True).
+    `name`, `equation` (of the exact value), `source` and labels may contain the function's arguments in braces, as for
+    `str.format`; names of float32 cases say so. `quantity` and `over`, the abscissa, end in their unit in brackets;
+    without a unit, `at` are labels. Errors may be `atol + rtol·|exact|`; `of_peak` is `atol` over the largest exact value.
+    `series` names curves, `defects` the findings of `oracles.defects` that it answers. `each` holds arguments of reported
+    rows, tuples or single values, `also` those of further tests; `slow` marks arguments of slow tests, or all (True).
     """
     quantity, unit = _with_unit(quantity)
     label, label_unit = _with_unit(over)

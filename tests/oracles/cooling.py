@@ -14,24 +14,24 @@ from tgdsl.sensors.temperature_grid.losses import stefan_boltzmann, zero_celsius
 
 ALUMINIUM = MATERIALS["aluminium"]
 SIDES = (0.02, 0.03, 0.04)
-"""Of the block [m]."""
+"""Sides of the block [m]."""
 AREA = 2 * (0.02 * 0.03 + 0.03 * 0.04 + 0.04 * 0.02)
 HEAT = ALUMINIUM.density * ALUMINIUM.specific_heat * 0.02 * 0.03 * 0.04
 """Its surface [m²] and heat capacity [J/K]."""
 oracle = field("heat: losses and lag", "temperature_grid")
 LUMP: dict[str, Any] = {"like": "aluminium", "conductivity": 2500.0}
-"""Aluminium that conducts like diamond."""
+"""Aluminium with the conductivity of diamond."""
 
 
 def cooled(dt: float, seconds: float, dtype: torch.dtype = torch.float64, **sensor: Any) -> float:
-    """Return the temperature of a block that begins at 100 °C, read to the end [°C]."""
+    """Return the temperature of a block that starts at 100 °C, read to the end [°C]."""
     parameters = {"cells": [1, 1, 1], "material": LUMP, "temperature": 100.0, **sensor}
     *_, last = heated({"block": SIDES}, parameters, dt, round(seconds / dt), dtype=dtype)
     return float(last["heat"][0].mean())
 
 
 def transmitted(h: float, axes: str = "xyz") -> float:
-    """Return what the block's faces across some axes conduct from what it holds to the air, 2A/(1/h + Δ/6k) each [W/K]."""
+    """Return the conductance of the block's faces across these axes to the air, 2A/(1/h + Δ/6k) each [W/K]."""
     areas = {"x": SIDES[1] * SIDES[2], "y": SIDES[0] * SIDES[2], "z": SIDES[0] * SIDES[1]}
     sides = dict(zip("xyz", SIDES, strict=True))
     return sum(2 * areas[axis] / (1 / h + sides[axis] / (6 * LUMP["conductivity"])) for axis in axes)
@@ -112,7 +112,7 @@ def slab_roots(biot: float, count: int = 60) -> np.ndarray:
 
 
 def slab_mean(biot: float, fourier: float) -> float:
-    """Return the mean temperature of a slab that began at 1, from Bi = hL/k and Fo = αt/L², L half of its thickness."""
+    """Return the mean temperature of a slab that started at 1, by Bi = hL/k and Fo = αt/L²; L is half its thickness."""
     beta = slab_roots(biot)
     return float((2 * np.sin(beta) ** 2 / (beta * (beta + np.sin(beta) * np.cos(beta))) * np.exp(-(beta**2) * fourier)).sum())
 

@@ -1,6 +1,6 @@
-"""What was found in the paper's published implementation, and where this package's figure for it is computed.
+"""Findings about the paper's published implementation, and where this package's figure for each is computed.
 
-Each was measured on that implementation (release 1.4.5, on a CPU) or read from its code: facts, in words of this package.
+Each was measured on that implementation (release 1.4.5, on a CPU) or read from its code.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 
 class Defect(NamedTuple):
-    """A finding; `measured` is empty where it was read from the code, `answered_in` names the report with our figure."""
+    """A finding; `measured` is empty if it was read from the code, `answered_in` names the report with our figure."""
 
     number: int
     about: str

@@ -14,7 +14,7 @@ from tgdsl.sensors.noise.stages import crosstalk_kernel
 
 oracle = field("filters", "noise")
 EXACT = 1e-12
-"""Of filters in float64."""
+"""Tolerance of filters in float64."""
 
 
 @oracle(
@@ -37,7 +37,7 @@ PRESS = (np.array([0.0, 0.02, 0.1, 0.13, 0.15, 0.16, 0.18, 0.2, 0.3]), np.array(
 
 
 def maxwell(t: np.ndarray) -> np.ndarray:
-    """Return the branch's exact answer to `PRESS`: each bend of the signal adds a ramp's, β Δv τ (1 − e^(−t/τ))."""
+    """Return the branch's exact response to `PRESS`: each bend of the signal adds a ramp's, β Δv τ (1 − e^(−t/τ))."""
     times, values = PRESS
     bends = np.diff(np.diff(values) / np.diff(times), prepend=0, append=0)
     since = np.maximum(t[:, None] - times, 0)
@@ -45,7 +45,7 @@ def maxwell(t: np.ndarray) -> np.ndarray:
 
 
 def maxwell_of_the_paper(signal: np.ndarray, dt: float) -> np.ndarray:
-    """Return the paper's update, which depends on the step where the signal is a ramp."""
+    """Return the paper's update, which depends on the step while the signal is a ramp."""
     lag = np.zeros(len(signal))
     for i in range(1, len(signal)):
         lag[i] = np.exp(-dt / TAU) * lag[i - 1] + signal[i] - signal[i - 1]
@@ -91,7 +91,7 @@ def maxwell_cycle(parts: int, dtype: torch.dtype = torch.float64):
 
 
 def grid(rows: int, columns: int, spacing: float) -> np.ndarray:
-    """Return places on a grid (taxel, 3) [m]."""
+    """Return positions on a grid (taxel, 3) [m]."""
     x, y = np.meshgrid(np.arange(columns), np.arange(rows))
     return spacing * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
 
@@ -150,7 +150,7 @@ def crosstalk_edges(num: int = 15, sigma: float = 2 * MM):
     "moments over σ, σ² [1]", at=["x", "y", "x²", "y²"], rtol=1e-6, atol=1e-12, each=[1.0], also=[0.3],
 )  # fmt: skip
 def crosstalk_variance(strength: float):
-    # Sums over a grid are integrals to 4π²σ²/h² e^(−2π²σ²/h²), 2e-7 for σ = h; the grid reaches 10 σ.
+    # Sums over a grid equal integrals to 4π²σ²/h² e^(−2π²σ²/h²), 2e-7 for σ = h; the grid extends to 10 σ.
     layout, sigma = make_layout(grid(21, 21, MM)), 1.0 * MM
     source = np.zeros((441, 1))
     source[220] = 1

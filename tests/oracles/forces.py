@@ -22,10 +22,10 @@ MASS = 0.25
 ROUNDING = 1e-12
 """Sums of float64 forces of about 1 N [N]."""
 AT_REST = 1e-5
-"""How near to its end a cube that settles has come [N]."""
+"""Remaining error of a cube that settles [N]."""
 AXES = ("x", "y", "z")
 PLACES = ((0.0, 0.0, 0.0), (0.006, -0.003, 0.0), (0.004, 0.002, 30.0))
-"""Of the cube on the pad: x, y [m] and the angle about z [deg]."""
+"""Poses of the cube on the pad: x, y [m] and the angle about z [deg]."""
 oracle = field("forces: contacts", "force_taxel")
 PAPER: dict[str, Any] = {"kind": "kinematic_taxel", "model": "paper", "outputs": ["force"]}
 
@@ -148,7 +148,7 @@ def centre_of_pressure(place: tuple[float, float, float]):
 
 def made_up(touch: TactileModule, pos: Any, force: Any, torque: Any = None, net: Any = None, depth: float = 0.001,
             normal: Any = (0, 0, -1)) -> SceneState:  # fmt: skip
-    """Return a state with given contacts on the pad [m], [N], [N·m]; the cube is `depth` above its surface [m]."""
+    """Return a state with these contacts on the pad [m], [N], [N·m]; the cube is `depth` above its surface [m]."""
     num, slots = len(pos), touch.inputs.slots
     fields: dict[str, Any] = {
         name: torch.zeros(1, 1, slots, 3, dtype=torch.float64) for name in ("pos", "force", "torque", "normal")
@@ -212,7 +212,7 @@ def torque_carried():
 OFFSET = """<mujoco><option gravity="0 0 0"/><worldbody><body name="pad"><geom size=".01"/></body>
 <body name="cube" pos="0 0 .3"><freejoint/><geom type="box" size=".02 .02 .02" pos=".008 .003 -.002"/></body></worldbody>
 <keyframe><key name="start" qvel=".3 -.2 .1 20 -30 25"/></keyframe></mujoco>"""
-"""A body that turns, its centre of mass 8.8 mm off its frame's origin."""
+"""A rotating body with its centre of mass 8.8 mm off its frame's origin."""
 
 
 @field("forces: contacts", "kinematic_taxel", "proximity")(

@@ -1,4 +1,4 @@
-"""Stick and slip of a ball on a skin of taxels: the loop of a tangential cycle on a Winkler foundation, and Mindlin's."""
+"""Stick and slip of a ball on a skin of taxels: tangential cycles on a Winkler foundation, and Mindlin's."""
 
 import numpy as np
 import torch
@@ -11,13 +11,13 @@ from tgdsl.sensors.elastomer.anchors import PLANES, StickSlip, advance
 
 oracle = field("contact mechanics: friction", "elastomer")
 RADIUS, DEPTH, SLIP = 0.02, 1e-3, 0.4
-"""Of the ball, how deep it is [m], and the largest displacement per depth."""
+"""Radius and depth of the ball [m], and the largest displacement per depth."""
 TURN = 0.8
-"""Where the motion turns back, over the displacement at which all slides."""
+"""Reversals of the motion, over the displacement of full slip."""
 
 
 class _Pad:
-    """A ball held in a pad, moved along x; its pull over that of full slip."""
+    """A ball held in a pad and moved along x; its pull relative to full slip."""
 
     def __init__(self) -> None:
         line = np.linspace(-7e-3, 7e-3, 121)
@@ -34,7 +34,7 @@ class _Pad:
         return vec(torch.from_numpy(np.array(part)) for part in parts)
 
     def pull(self, s: float) -> float:
-        """Return the sum of tangential displacements, over that of full slip, of a ball that is moved by s [m]."""
+        """Return the pull of a ball moved by s [m], relative to full slip."""
         depth = torch.from_numpy(self.depth)[None]
         zero = torch.zeros_like(depth)
         frame = Frame(rot((zero + 1, zero, zero, zero, zero + 1, zero, zero, zero, zero + 1)), (zero - s, zero, zero))

@@ -1,4 +1,4 @@
-"""Distances of primitives, and of meshes on grids, against distances that need no code, or points built at a known one."""
+"""Distances of primitives and meshes, against known values, or points built at a known distance."""
 
 from typing import Any
 
@@ -34,7 +34,7 @@ KNOWN: tuple[Row, ...] = (
     ("ellipsoid", (1, 2, 3), (0, 0, 0), -1.0, (1, 0, 0)),
     ("ellipsoid", (2, 2, 2), (0, 3, 4), 3.0, (0, 0.6, 0.8)),
 )
-"""Distances that need no code: shape, size, point, distance, gradient."""
+"""Known distances: shape, size, point, distance, gradient."""
 PRIMITIVES = (
     ("plane", (1.0, 1.0, 0.1)),
     ("sphere", (0.02, 0.0, 0.0)),
@@ -47,7 +47,7 @@ PRIMITIVES = (
     ("ellipsoid", (0.02, 0.02, 0.01)),
     ("ellipsoid", (0.05, 0.005, 0.02)),
 )
-"""Shapes and sizes [m] whose surfaces points are built on."""
+"""Shapes and sizes [m] of surfaces with known points."""
 HALF, REACH = 0.02, 0.01
 """Half the edge of the cube of 4 cm, and the radius of its probes [m]."""
 
@@ -100,7 +100,7 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 
 
 Surface = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Points of a surface, outward normals there, and how deep a point stays the nearest one [m]."""
+"""Points of a surface, their outward normals, and to which depth each is the nearest one [m]."""
 
 
 def surface_points(shape: str, size: tuple[float, ...], rng: np.random.Generator, num: int) -> Surface:
@@ -126,7 +126,7 @@ def surface_points(shape: str, size: tuple[float, ...], rng: np.random.Generator
 def _box_points(size: np.ndarray, rng: np.random.Generator, num: int) -> Surface:
     inside = size * rng.uniform(-1, 1, (num, 3))
     normal = unit(np.abs(rng.normal(size=(num, 3)))) * rng.choice([-1.0, 1.0], (num, 3))
-    fixed = rng.permuted(np.tile([True, False, False], (num, 1)), axis=1)  # which axes are at their end: a face,
+    fixed = rng.permuted(np.tile([True, False, False], (num, 1)), axis=1)  # which axes are at their limit: a face,
     fixed |= rng.random((num, 3)) < 0.3  # an edge or a corner
     normal = unit(normal * fixed)
     surface = np.where(fixed, np.sign(normal) * size, inside)
@@ -208,7 +208,7 @@ def mesh_scene(
     mesh: trimesh.Trimesh | None, probes: np.ndarray, *, kind: str = "contact_depth", scale: float = 1.0,
     geoms: str = '<geom type="mesh" mesh="item"/>', dtype: torch.dtype = torch.float64, **target: Any,
 ) -> tuple[Any, SceneState]:  # fmt: skip
-    """Return a module whose probes of 10 mm feel a mesh, or geoms, and its scene with all at the origin: see `module`."""
+    """Return a module whose probes of 10 mm feel a mesh or geoms, and its scene at the origin: see `module`."""
     gate = None if kind == "surface_distance" else "geometric"
     fields = {"kind": kind, "gate": gate, "mesh": mesh, "scale": scale, "target": target, "dtype": dtype, "radius": REACH}
     touch = probed(probes, geoms, **fields)
@@ -220,9 +220,9 @@ WAYS: dict[str, tuple[dict[str, Any] | None, float]] = {
     "sdf": ({"query": "sdf"}, 5e-5),
     "raycast": ({"query": "raycast"}, 1e-6),
 }
-"""How a cube is queried: as a primitive, as a mesh on a grid, as a mesh triangle by triangle; and what each may err [m]."""
+"""Queries of a cube with their tolerances [m]: as a primitive, as a mesh on a grid, and per triangle."""
 SPOTS = [(x, y) for x in (-0.012, 0.0, 0.007) for y in (-0.009, 0.003)]
-"""Places of probes over the cube's upper face [m]."""
+"""Positions of probes over the cube's upper face [m]."""
 
 
 @oracle(

@@ -1,6 +1,6 @@
 """Contact mechanics: loads on an elastic half-space, against Johnson, *Contact Mechanics* (1985).
 
-z points into the solid; a load is (Qx, Qy, P), P into it. The shear modulus of all is `G`.
+z points into the solid; a load is (Qx, Qy, P), P into it. All have the shear modulus `G`.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ AXES = ("x", "y", "z")
 
 
 def displacement(point: np.ndarray | Place, patch: float, nu: float, load: Load) -> np.ndarray:
-    """Return this package's displacement (3,) [m] at a place below a load at the origin, spread over a patch's radius [m]."""
+    """Return tgdsl's displacement (3,) [m] at a point below a load at the origin, spread over a patch's radius [m]."""
     x, y, z = (float(part) for part in point)
     r = np.hypot(x, y)
     e = np.array([x, y]) / r
@@ -205,7 +205,7 @@ def hankel(z: float, a: float = 1e-3, nu: float = 0.35, r: float = 2.3e-3):
 
 
 def flat_skin(x: np.ndarray, y: np.ndarray, pitch: float) -> LinkTaxels:
-    """Return taxels at places x, y (taxel,) of a plane, normals +z, each with the area of a pitch squared [m]."""
+    """Return taxels at x, y (taxel,) of a plane, normals +z, each with the area of a pitch squared [m]."""
     count = len(x)
     pos, normal = np.stack([x, y, 0 * x], axis=1), np.tile([0.0, 0, 1], (count, 1))
     return LinkTaxels(pos, normal, np.full(count, pitch**2), np.full((count, 2), -1), np.ones(count, dtype=bool))

@@ -1,4 +1,4 @@
-"""What a microphone hears of sources at rest and in motion, against closed forms."""
+"""Sound of resting and moving sources at a microphone, against closed forms."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""Heat: conduction within a link, and between what touches, against Carslaw and Jaeger, *Conduction of Heat in Solids*."""
+"""Heat: conduction within a link and between touching bodies, against Carslaw and Jaeger, *Conduction of Heat in Solids*."""
 
 from functools import cache
 from typing import Any
@@ -19,7 +19,7 @@ ALPHA = STEEL.conductivity / (STEEL.density * STEEL.specific_heat)
 """Thermal diffusivity of steel [m²/s]."""
 oracle = field("heat: conduction and contact", "temperature_grid")
 SIDES, COUNT = [0.02, 0.03, 0.04], [5, 4, 6]
-"""Of a block [m], and its cells."""
+"""Sides of a block [m], and its cells."""
 ALLOY: dict[str, Any] = {"like": "aluminium", "conductivity": 167.0, "density": 2700.0, "specific_heat": 896.0}
 HARD_RUBBER: dict[str, Any] = {"like": "rubber", "conductivity": 0.16, "density": 1190.0, "specific_heat": 2010.0}
 """Incropera, tables A.1 and A.3: aluminium 6061, hard rubber."""
@@ -32,7 +32,7 @@ def mode(numbers: Any, count: Any) -> np.ndarray:
 
 
 def rate(numbers: Any, count: Any, sides: Any, continuous: bool) -> float:
-    """Return how fast a mode decays, of the cells or of the continuous solid [1/s]."""
+    """Return the decay rate of a mode, of the cells or of the continuous solid [1/s]."""
     total = 0.0
     for m, n, side in zip(numbers, count, sides, strict=True):
         total += (np.pi * m / side) ** 2 if continuous else (2 * n / side * np.sin(0.5 * np.pi * m / n)) ** 2
@@ -41,7 +41,7 @@ def rate(numbers: Any, count: Any, sides: Any, continuous: bool) -> float:
 
 def decayed(count: Any, sides: Any, numbers: Any, dt: float, steps: int = 1, dtype: torch.dtype = torch.float64,
             **sensor: Any) -> float:  # fmt: skip
-    """Return what is left of a mode, over what there was; not-a-number if anything else is left."""
+    """Return the remaining fraction of a mode; NaN if other modes appear."""
     with folder() as where:
         module = heat_module(where, {"block": sides}, {"cells": count, "material": "steel", **sensor}, dtype=dtype)
     state, above = heat_state(module, dt), 10.0 * mode(numbers, count)
@@ -104,7 +104,7 @@ def order_in_space(numbers: Any = (1, 2, 1)):
 
 @cache
 def risen(seconds: float, flux: float, depth: float, n: int, dt: float = 0.05) -> np.ndarray:
-    """Return how much the cells of a thick solid warm, from its heated surface on [K]."""
+    """Return the temperature rise of a thick solid's cells, starting at its heated surface [K]."""
     sensor = {"cells": [1, 1, n], "material": "steel", "source": {"flux": f"{flux} W/m2", "face": "+z"}}
     *_, last = heated({"block": [0.01, 0.02, depth]}, sensor, dt, round(seconds / dt))
     return last["heat"][0, :, 0].numpy()[::-1] - 22.0
@@ -199,7 +199,7 @@ def spot_in_long_steps(num: int, dt: float, seconds: float = 1.0):
 
 
 def half_space(count: int) -> np.ndarray:
-    """Return the Green's function of the surface layer of a half-space of unit cubes that conduct 1 [1]."""
+    """Return the Green's function of the surface layer of a half-space of unit cubes with conductivity 1 [1]."""
     nodes, weights = np.polynomial.legendre.leggauss(300)
     u, w = 0.5 * (nodes + 1), 0.5 * weights
     k, dk = np.pi * u**3, 3 * np.pi * u**2 * w
@@ -232,7 +232,7 @@ def greens_function_far_off():
     also=[0.25, 0.35, 0.7, 1.4, 2.0, 2.8, 8.0],
 )  # fmt: skip
 def circular_spot(cell: float):
-    # The half-space is a lattice known by its Green's function: what the spot's conductances leave to it is solved.
+    # The Green's function of the lattice is known; solve for the heat that the spot's conductances pass on to it.
     count = 2 * int(np.ceil(1 / cell)) + 7
     green, size = half_space(count), torch.tensor([float(count)], dtype=torch.float64)
     one = torch.ones(1, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""The law of depth and velocity of a kinematic taxel: by hand, and as a Winkler foundation under a ball.
+"""A kinematic taxel's law of depth and velocity: by hand, and as a Winkler foundation under a ball.
 
 A box comes down on a probe at the origin of its link, 4 mm deep; its face looks down, so the contact's normal is −z.
 """
@@ -29,7 +29,7 @@ STILL: dict[str, Any] = {"normal_damping": 0, "shear_damping": 0, "outputs": ["f
 
 
 def read(probe: Any = (0.0, 0.0, 0.0), sensor: dict[str, Any] | None = None, **item: Any) -> np.ndarray:
-    """Return a probe's reading, force [N] and torque [N·m] if it is asked for, of a box 4 mm deep that moves as said."""
+    """Return a probe's force [N], and torque [N·m] on request, for a moving box 4 mm deep."""
     touch = probed([probe], BOX, kind="kinematic_taxel", **(sensor or {}))
     return touch(state(touch, **{**ABOVE, **item}))["s"][0, 0].numpy()
 
@@ -137,7 +137,7 @@ def winkler_exponent(alpha: float):
 
 
 def balanced(probes: Any, forces: Any, normals: Any = ((0, 0, -1),), item: Any = None, **sensor: Any) -> tuple[Any, Any]:
-    """Return readings of a pad whose solver has the given contacts [N], balanced and not."""
+    """Return balanced and unbalanced readings of a pad with these contacts of the solver [N]."""
     item = {**ABOVE} if item is None else item
     with folder() as where:
         touch = module(where, probes, BOX, kind="kinematic_taxel", balance="solver", slots=4, **sensor)

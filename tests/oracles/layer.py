@@ -93,7 +93,7 @@ def thin_incompressible(t: float = 1e-3, k: float = 30.0):
 
 
 def _off_half_space(z: float, nu: float, t: float, a: float = 1e-3) -> float:
-    """Return how far a layer's five profiles are from the half-space's, over the largest."""
+    """Return the deviation of a layer's five profiles from the half-space's, over the largest value."""
     r = np.linspace(0.0, 0.02, 21)
     layer, limit = profiles(r, Layer(t, z, G, nu), a), half_space(r, z, a, G, nu)
     return max(float(np.abs(p - q).max()) for p, q in zip(layer, limit, strict=True)) / float(limit.normal.max())
@@ -148,7 +148,7 @@ def no_volume():
 
 
 def _pressed_ball(depth: float, radius: float, layer: Layer, num: int) -> float:
-    """Return the force [N] of a ball on a skin of taxels: pressures that move it to the ball's shape, none of which pulls."""
+    """Return the force [N] of a ball on a skin of taxels: nonnegative pressures that move it to the ball's shape."""
     reach = 1.45 * np.sqrt(radius * depth)
     pitch = 2 * reach / num
     line = (np.arange(num) + 0.5) * pitch - reach

@@ -1,4 +1,4 @@
-"""Displacements of an elastomer's markers by hand: a ball pressed on two taxels and moved along them; resolution; curvature.
+"""Displacements of an elastomer's markers by hand: a ball pressed on two taxels and moved; resolution; curvature.
 
 "The paper" is `model: paper` with `normalize: peak`, the formula as printed.
 """
@@ -23,7 +23,7 @@ APART = np.array([0.004, 0.003, 0.0])
 AREA = np.pi * 1e-4
 """Area of a taxel of the scene, a disc of its radius of 10 mm [m²]."""
 WEIGHT = AREA / 6e-6
-"""The same over the reference area."""
+"""The area over the reference area."""
 STRENGTH, DILATION, SHEAR, ALPHA = 100.0, 8000.0, 2000.0, 1.2
 """The paper's s_d = s_s, λ_d, λ_s [1/m²] and α."""
 ELASTIC: dict[str, Any] = {"kernel": "half_space", "youngs_modulus": 2e5, "poissons_ratio": 0.48, "normal_stiffness": 1e8}
@@ -36,7 +36,7 @@ by_hand = partial(oracle, source=SOURCE, quantity="displacement [m]")
 
 
 def pressed(way: Any = (0.0, 0.0), probes: Any = PROBES, depth: float = DEPTH, **sensor: Any) -> np.ndarray:
-    """Return displacements (taxel, 3) [m] under a ball over the first taxel, some depth into it, then moved along the skin."""
+    """Return displacements (taxel, 3) [m] under a ball pressed into the first taxel, then moved along the skin."""
     touch = probed(probes, BALL, kind="elastomer", **sensor)
     touch(state(touch, pos=[0, 0, 0.01 - depth]))
     return touch(state(touch, pos=[*way, 0.01 - depth]))["s"][0].numpy()
@@ -146,7 +146,7 @@ def standoff(gate: str | None = None):
 
 
 def sheet(n: int, side: float, curve: float | None = None) -> LinkTaxels:
-    """Return a flat n × n pad of some side [m], normals +z; or bent around the y axis to a radius [m]."""
+    """Return an n × n pad of a side [m], flat with normals +z, or bent around the y axis to a radius [m]."""
     line = (np.arange(n) + 0.5) / n * side - side / 2
     x, y = (part.reshape(-1) for part in np.meshgrid(line, line, indexing="ij"))
     cell = np.stack(np.meshgrid(np.arange(n), np.arange(n), indexing="ij"), axis=-1).reshape(-1, 2)

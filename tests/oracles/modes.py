@@ -1,7 +1,7 @@
 """Modes of free bodies from their shape, against closed forms, or Timoshenko's and Kirchhoff's theories.
 
-Wave numbers are κ = ω L/c with c = √(E/ρ) and the longest side L of the bounding box. Quadratic elements give a little too
-much: tolerances are what the meshes leave, at most 2 %.
+Wave numbers are κ = ω L/c with c = √(E/ρ) and the longest side L of the bounding box. Quadratic elements are slightly too
+stiff: tolerances are errors of the meshes, at most 2 %.
 """
 
 from dataclasses import replace
@@ -53,7 +53,7 @@ def rod():
 
 
 def all_modes(surface: Surface, cell: float, poissons_ratio: float, count: int) -> np.ndarray:
-    """Return κ of all modes, those that are not heard too, on cells of a size over L."""
+    """Return κ of all modes, audible or not, on cells of a size over L."""
     vertices, faces = closed(surface)
     vertices = vertices / np.ptp(vertices, axis=0).max()
     vertices = vertices @ cells.axes(vertices, faces).T
@@ -89,7 +89,7 @@ def square_plate():
 
 
 def made_of(material: Material, num_modes: int = 8) -> ShapeModes:
-    """Return what a document says of modes of a material."""
+    """Return the fields of a document for modes of a material."""
     return ShapeModes.model_construct(material=material, count=num_modes)
 
 

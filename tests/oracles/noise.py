@@ -19,7 +19,7 @@ NUM, SIDE = 10**6, 1000
 DT = 2e-3
 """Seconds between calls."""
 ERRORS = 5.0
-"""Standard errors that a statistic may be off."""
+"""Allowed deviation of a statistic in standard errors."""
 oracle = field("noise", "noise")
 statistics = partial(oracle, quantity="standard errors [1]", atol=ERRORS)
 
@@ -35,7 +35,7 @@ def reading(noise: Noise, signal: Any = 0.0) -> np.ndarray:
 
 
 def variance_error(sample: np.ndarray, expected: float, kurtosis: float = 3.0) -> float:
-    """Return how many standard errors the variance of a sample of mean 0 is off."""
+    """Return the error of the variance of a sample of mean 0, in standard errors."""
     return standard_errors((sample**2).mean(), expected, expected * np.sqrt((kurtosis - 1) / sample.size))
 
 
@@ -44,7 +44,7 @@ def _errors(**errors: float) -> Values:
 
 
 def _distance(value: float) -> float:
-    """Return √N times a distance of distributions, in what counts as standard errors."""
+    """Return √N times a distance of distributions, scaled to standard errors."""
     return value / KOLMOGOROV * ERRORS
 
 

@@ -1,4 +1,4 @@
-"""Moments of the surface within a probe's radius, and what `proximity` makes of them.
+"""Moments of the surface within a probe's radius, and readings of `proximity`.
 
 S0 = ∫ (R − |p − q|)₊ dA, S1 = ∫ (R − |p − q|)₊ (p − q) dA over the points p of a surface, q the probe.
 """
@@ -23,7 +23,7 @@ from tgdsl.surfaces.surface import Surface
 R = 0.01
 """Radius of the probes [m]."""
 TOLERANCE, LIMIT, COARSE = 0.008, 0.01, 0.04
-"""Of a field; what it may err at points spread otherwise than the compiler's; of fields whose accuracy is not the question."""
+"""Tolerance of a field; allowed error at other points than the compiler's; tolerance of fields in other tests."""
 PLANE = '<geom type="plane" size="1 1 .1"/>'
 AREA = 6 * 0.04**2
 DENSITY = 100 / AREA
@@ -35,14 +35,14 @@ CHANNELS = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
 
 
 def geom_of(shape: str, size: Sequence[Any], pos: Sequence[Any] = (0, 0, 0), surface: Surface | None = None) -> SurfaceGeom:
-    """Return an object's geom of some size [m] at a place [m]."""
+    """Return an object's geom with a size [m] at a position [m]."""
     whole = np.array([*size, 0, 0][:3], float)
     kind = "mesh" if surface is not None else shape
     return SurfaceGeom(Geom(0, "", "", "body", kind, whole, np.array(pos, float), np.eye(3), True), surface)
 
 
 def places(count: int = 400, seed: int = 5, extent: float = 0.028) -> np.ndarray:
-    """Return points all over a ball, of another draw than the compiler's [m]."""
+    """Return points all over a ball, other than the compiler's [m]."""
     rng = np.random.default_rng(seed)
     way = rng.normal(size=(count, 3))
     return extent * np.cbrt(rng.uniform(size=(count, 1))) * way / np.linalg.norm(way, axis=1, keepdims=True)
@@ -51,7 +51,7 @@ def places(count: int = 400, seed: int = 5, extent: float = 0.028) -> np.ndarray
 def sphere_moments(pos: np.ndarray, b: float = 0.02, radius: float = R) -> np.ndarray:
     """Return S0 and S1 (point, 4) of a ball of radius b [m].
 
-    With D the distance of the centre: dA = 2π (b/D) r dr, and p − q has the part (D² + r² − b²)/2D towards it.
+    With the distance D of the centre: dA = 2π (b/D) r dr, and p − q has the component (D² + r² − b²)/2D towards it.
     """
     moments = []
     for q in pos:
@@ -83,7 +83,7 @@ def box_moments(pos: np.ndarray, half: Sequence[Any], radius: float = R, num: in
 
 
 def rms(moments: np.ndarray, exact: np.ndarray) -> tuple[float, float]:
-    """Return root mean square errors of S0 and of S1, over their full scale."""
+    """Return RMS errors of S0 and S1 over their full scale."""
     error = moments - exact
     full = np.abs(exact[:, 0]).max(), np.linalg.norm(exact[:, 1:4], axis=1).max()
     mean = np.mean(error[:, 0] ** 2), np.mean((error[:, 1:4] ** 2).sum(axis=1))
@@ -91,12 +91,12 @@ def rms(moments: np.ndarray, exact: np.ndarray) -> tuple[float, float]:
 
 
 def sums(geoms: list[SurfaceGeom], pos: np.ndarray, radius: float = R, spacing: float = R / 8, channels: int = 4) -> np.ndarray:
-    """Return this package's sums over a fine surface (point, channel)."""
+    """Return tgdsl's sums over a fine surface (point, channel)."""
     return moment_sums(outer_surface(geoms, spacing).quadrature(spacing), pos, radius, channels, 1)
 
 
 def field_reads(baked: Any, pos: np.ndarray) -> np.ndarray:
-    """Return what a field reads (point, channel), with slopes if it has them."""
+    """Return the readings of a field (point, channel), with slopes if it has them."""
     *num, channels = baked.values.shape
     place, cell = split(torch.tensor(baked.origin)), torch.tensor(baked.cell, dtype=torch.float64)
     flat = torch.tensor(baked.values.reshape(-1, channels), dtype=torch.float64)
@@ -109,7 +109,7 @@ def field_reads(baked: Any, pos: np.ndarray) -> np.ndarray:
 
 
 def cloud_reads(cloud: Any, pos: np.ndarray, radius: float = R) -> np.ndarray:
-    """Return what sums over sampled points read (point, 4), as the paper takes them."""
+    """Return sums over sampled points (point, 4), as in the paper."""
     grown = np.concatenate([cloud.points, [[1e6] * 3]])
     x, y, z = (torch.tensor(part) for part in grown.T.copy())
     place, cell = split(torch.tensor(cloud.origin)), torch.tensor(cloud.cell, dtype=torch.float64)
@@ -171,7 +171,7 @@ def sampling_noise():
 
 
 def _scalene(a: float, b: float, c: float) -> float:
-    """Return the area of an ellipsoid by its parameters' fundamental form, summed with weights of Gauss and Legendre."""
+    """Return the area of an ellipsoid by Gauss–Legendre quadrature of its first fundamental form."""
     node, weight = np.polynomial.legendre.leggauss(200)
     u, v = (node[:, None] + 1) * np.pi / 2, (node + 1) * np.pi
     x, y, z = np.sin(u) * np.cos(v) * b * c, np.sin(u) * np.sin(v) * a * c, np.cos(u) * a * b + 0 * v

@@ -1,4 +1,4 @@
-"""The sheets of `tgdsl bench --oracles` and `--hard`: every registered comparison and hard case that is reported."""
+"""The sheets of `tgdsl bench --oracles` and `--hard`: all reported comparisons and hard cases."""
 
 from collections.abc import Callable, Sequence
 from importlib import import_module
@@ -35,9 +35,9 @@ HARD_ABOUT = (
     "be; not-a-number and infinity count as infinite. Both precisions are given float64 poses, as simulators give them."
 )
 Results = dict[str, tuple[list[Any], list[tuple[str, str]]]]
-"""By section the results, and the names and reasons of what cannot be computed here."""
+"""By section, the results, and names and reasons of cases that cannot be computed here."""
 Begun = Callable[[str, int, int], None]
-"""Called before each case with its section, the number of cases done, and of all; and once at the end."""
+"""Called before each case with its section and the numbers of finished and of all cases; once more at the end."""
 
 
 def run(cases: Sequence[Case] = CASES, begun: Begun | None = None) -> Results:

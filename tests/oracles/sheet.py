@@ -23,12 +23,12 @@ class Entry:
     Attributes:
         title: One line.
         cells: Its cells of the table, after the title.
-        record: The same for CSV and JSON.
-        notes: Lines beside the plot.
+        record: Its values for CSV and JSON.
+        notes: Lines next to the plot.
         draw: Draws the plot.
         holds: Whether the result is right.
-        defects: Numbers of the findings about the paper's implementation that it answers.
-        figure: The figure that answers them.
+        defects: Numbers of the findings that it answers.
+        figure: The value that answers them.
     """
 
     title: str
@@ -43,7 +43,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Section:
-    """Entries that belong together, and the names and reasons of what could not be computed here."""
+    """Entries of a section, and names and reasons of those that could not be computed here."""
 
     name: str
     entries: tuple[Entry, ...]
@@ -135,7 +135,7 @@ def _findings(sheet: Sheet) -> str:
 
 
 def findings(entries: Iterable[Entry]) -> list[tuple[Defect, str, str]]:
-    """Return each finding with title and figure of the first entry that answers it, or with empty ones."""
+    """Return each finding with title and figure of the first entry that answers it, or empty strings."""
     first: dict[int, tuple[str, str]] = {}
     for entry in entries:
         for number in entry.defects:

@@ -1,7 +1,7 @@
 """Sound of contacts and of motors, against closed forms.
 
-"The paper" is `model: paper` of contact audio on the same states: its two-pole resonators as they are printed, each struck by a
-rise of the force ΔF with ΔF Δt, of which the paper gives no formula.
+"The paper" is `model: paper` of contact audio on the same states: its two-pole resonators as printed, each struck with ΔF Δt
+by a rise of the force ΔF, for which the paper gives no formula.
 """
 
 import math
@@ -39,7 +39,7 @@ PAPER = {"model": "paper"}
 
 
 def times(samples: int, num_steps: int) -> np.ndarray:
-    """Return when samples are [s]."""
+    """Return the times of samples [s]."""
     return np.arange(1, samples * num_steps + 1) * STEP / samples
 
 
@@ -194,7 +194,7 @@ def bands(num_steps: int = 4):
 
 
 def spectrum_of(samples: np.ndarray) -> np.ndarray:
-    """Return the amplitudes of sines that fit a whole number of times, by their number."""
+    """Return the amplitudes of sines by their whole numbers of periods."""
     return np.abs(np.fft.rfft(samples)) / (len(samples) / 2)
 
 

@@ -1,4 +1,4 @@
-"""Every comparison and every hard case holds; each kind and each finding has one."""
+"""Every comparison and hard case holds; each kind and each finding has one."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from tgdsl.sensors import KINDS
 
 
 def assert_holds(comparison: Comparison) -> None:
-    """Assert that each number is as near to its exact value as the comparison allows."""
+    """Assert that each value is within the comparison's tolerance of its exact value."""
     assert len(comparison.at) == comparison.exact.shape[-1]
     assert not comparison.series or len(comparison.series) == len(comparison.exact)
     np.testing.assert_allclose(
@@ -22,7 +22,7 @@ def assert_holds(comparison: Comparison) -> None:
 
 
 def assert_stands(case: HardCase) -> None:
-    """Assert that each error of a hard case is as small as it must be, in each precision."""
+    """Assert that each error of a hard case is within its limit, in each precision."""
     for precision, allowed in case.errors.items():
         assert len(allowed.errors) == len(case.parts)
         for part, error in zip(case.parts, allowed.errors, strict=True):
@@ -39,7 +39,7 @@ def cache(tmp_path_factory):
 @pytest.mark.oracle
 @pytest.mark.parametrize("case", [pytest.param(case, id=case.name) for case in CASES])
 def test_it_holds(case, cache, monkeypatch):
-    """Modes are analysed here, whatever a cache has of them."""
+    """A fresh cache forces the modal analysis."""
     if case.section == "sound: modes of bodies":
         monkeypatch.setenv("TGDSL_CACHE", str(cache))
     assert_holds(case.compute())
@@ -63,7 +63,7 @@ def test_each_kind_and_each_finding_has_a_row():
 
 @pytest.fixture
 def decorated():
-    """Undo what a test registers."""
+    """Undo registrations of a test."""
     before = list(CASES)
     yield lambda **fields: oracle("section", ("kind",), "{x:mm} of {words}", "e", "s", "depth [m]", "at x [m]", **fields)
     CASES[:] = before

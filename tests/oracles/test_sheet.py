@@ -1,4 +1,4 @@
-"""Sheets as text and files: what they contain, and that they are the same each time."""
+"""Sheets as text and files: contents and repeatability."""
 
 import csv
 import json

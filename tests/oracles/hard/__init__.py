@@ -1,1 +1,1 @@
-"""The numerical hard cases of all kinds: what could go wrong, and how far a module is from its kind's float64 definition."""
+"""Numerical hard cases of all kinds: risks, and errors of modules against their kinds' float64 definitions."""

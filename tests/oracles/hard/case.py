@@ -65,10 +65,10 @@ def hard(
 ) -> Callable[[Callable], Callable[..., HardCase]]:  # fmt: skip
     """Register a function of a dtype that returns errors, or `Errors`, and let it return a `HardCase`.
 
-    `name` and `risk`, what could go wrong, may contain the function's arguments in braces. `reference` is what readings are
-    compared with, `unit` that of the errors: "of full scale", "m", or the name of what is counted. `parts` name what it is
-    tried on; of a mapping the function is called with each value after the dtype, and returns one error. `float64` and
-    `float32` are the largest allowed errors; None: not tried. `defects`, `each` and `also` as in `oracle`.
+    `name` and `risk` may contain the function's arguments in braces. Readings are compared with `reference`; `unit` is
+    that of the errors: "of full scale", "m", or the counted things. `parts` names the variants; for a mapping, the
+    function takes each value after the dtype and returns one error. `float64` and `float32` are the largest allowed
+    errors; None: not tested. `defects`, `each` and `also` are as in `oracle`.
     """
 
     def decorate(function: Callable) -> Callable[..., HardCase]:

@@ -1,4 +1,4 @@
-"""What is hard for contacts, memory and time: thousands of contacts, steps from 1 µs to 10 s, noise, resets, bytes."""
+"""Hard cases of contacts, memory and time: thousands of contacts, steps from 1 µs to 10 s, noise, resets, bytes."""
 
 import dataclasses
 from functools import partial
@@ -26,7 +26,7 @@ hard = partial(case.hard, "contacts, time and memory")
 
 
 def _total(touch: TactileModule, pos: np.ndarray, force: np.ndarray, net: np.ndarray | None = None) -> np.ndarray:
-    """Return the force (3,) [N] that taxels and `missed` sum to, of contacts (contact, 3)."""
+    """Return the sum (3,) [N] of taxels and `missed` for contacts (contact, 3)."""
     with quiet():
         readings = touch(made_up(touch, pos, force, net=net))
     return (readings["s"][0].double().sum(dim=0) + readings["s/missed"][0, 0].double()).numpy()
@@ -119,7 +119,7 @@ def broken_reading_in_memory(dtype: torch.dtype):
 
 
 def _of_envs(touch: TactileModule, num: int, height: float) -> SceneState:
-    """Return the probes' object at some height in several environments."""
+    """Return the probes' object at a height in several environments."""
     return dataclasses.replace(repeated(state(touch, pos=[0, 0, height]), num), dt=0.01)
 
 
@@ -146,7 +146,7 @@ SENSORS: dict[str, tuple[dict[str, Any], int]] = {
     "drift": ({"noise": {"drift": 1e-3}}, 3 * 4),
     "history of 4": ({"history": 4}, 4 * 3 * 4),
 }
-"""Fields of a sensor, and the bytes per taxel that it needs from call to call."""
+"""Fields of a sensor, and the bytes per taxel of its state."""
 
 
 @hard(
@@ -175,14 +175,14 @@ TACTILE = """
 </mujoco>
 """
 TACTILE_TOLERANCE = 1e-6
-"""MuJoCo keeps mesh vertices in float32, 1e-9 m, and its distances of these shapes are exact: both leave room in this [m]."""
+"""Tolerance [m]: MuJoCo keeps mesh vertices in float32, 1e-9 m, and its distances of these shapes are exact."""
 TACTILE_SHAPES = {"sphere": ".02", "capsule": ".012 .02", "cylinder": ".015 .02"}
 
 
 def tactile_depth(shape: str) -> tuple[float, int]:
-    """Return how far depths are from those of MuJoCo's own `tactile` sensor at its vertices [m], and how many it touches.
+    """Return the errors of depths against MuJoCo's `tactile` sensor at its vertices [m], and how many it touches.
 
-    Pad and geoms are turned and off their bodies' centres of mass.
+    Pad and geoms are rotated and off their bodies' centres of mass.
     """
     text = TACTILE.format(shape=shape, size=TACTILE_SHAPES[shape])
     model = mujoco.MjModel.from_xml_string(text)

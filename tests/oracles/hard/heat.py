@@ -1,4 +1,4 @@
-"""What is hard for temperatures: any step, conductivity and area; resets with a lag; links that are turned; energy."""
+"""Hard cases of temperatures: any step, conductivity and area; resets with a lag; rotated links; energy."""
 
 import itertools
 from functools import cache, partial
@@ -14,7 +14,7 @@ from tgdsl.fields.materials import MATERIALS
 from tgdsl.module.module import TactileModule
 
 STEPS = (1e-4, 10.0)
-"""Seconds between calls, the shortest and the longest."""
+"""Shortest and longest seconds between calls."""
 ONE_CONTACT = [((0, 0, 0.005), (0, 0, -1), 2.0)]
 GRID = list(itertools.product(STEPS, (0.1, 400.0), (1e-9, 1e-2)))
 """Step [s], conductivity [W/(m·K)] and contact area [m²]."""
@@ -39,7 +39,7 @@ def _with_three_objects(k: float, area: float, dtype: torch.dtype) -> TactileMod
 
 
 def _beyond(dt: float, k: float, area: float, dtype: torch.dtype, rng: np.random.Generator) -> float:
-    """Return how far beyond −20 to 80 °C temperatures go of a link and three objects that are within [K]."""
+    """Return how far temperatures of a link and three objects leave their initial range, −20 to 80 °C [K]."""
     pairs = zip(OBJECTS, np.eye(3), strict=True)
     contacts = {("tip", name): [(tuple(rng.uniform(-5e-3, 5e-3, 3)), tuple(n), 1.0)] for name, n in pairs}
     module, worst = _with_three_objects(k, area, dtype), 0.0

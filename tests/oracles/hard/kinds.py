@@ -1,4 +1,4 @@
-"""What is hard for any kind: places far away, motion, sizes, contacts as no solver finds them, broken environments."""
+"""Hard cases of every kind: far positions, motion, sizes, contacts that no solver finds, broken environments."""
 
 import dataclasses
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from tgdsl.sensors import KINDS
 NAMES = tuple(kind.name for kind in KINDS)
 NUM_ENVS, NUM_CALLS = 2, 3
 FLOAT32, FLOAT64, FAR = 1e-5, 1e-11, 1e-9
-"""Largest error over the largest magnitude of the channel: 80 roundings of float32; rounding; 1 km away."""
+"""Largest error over the channel's largest magnitude: 80 float32 roundings; rounding; 1 km away."""
 READ_BY = {"contact_audio": ("contact_force",), "actuation_audio": ("joint_vel",)}
 """Fields to break for kinds that read no poses."""
 Change = Callable[[SceneState], SceneState]
@@ -47,7 +47,7 @@ def _any_length(state: SceneState) -> SceneState:
 
 
 def _opposing(state: SceneState) -> SceneState:
-    """Each pair is pressed from two sides at one place: the forces cancel."""
+    """Press each pair from two sides at one point, so that the forces cancel."""
     if state.contact_force is None or state.contact_force.shape[2] < 2:
         return state
     changed = {}
@@ -62,7 +62,7 @@ def _opposing(state: SceneState) -> SceneState:
 
 
 def _on_each_other(state: SceneState) -> SceneState:
-    """All bodies at one place and of one attitude: taxels deep inside, on axes and planes of symmetry."""
+    """Put all bodies in one pose: taxels deep inside, on axes and planes of symmetry."""
     one = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand_as(state.body_quat)
     return dataclasses.replace(state, body_pos=torch.zeros_like(state.body_pos), body_quat=one.clone())
 
@@ -83,7 +83,7 @@ CHANGES = (
     ("ten times the size", "lengths beyond the thresholds", _unchanged, True, FLOAT64, 10.0,
      tuple(name for name in NAMES if name != "proximity")),
 )  # fmt: skip
-"""Name, risk, change of the state; whether the reference reads the changed state; error in float64, scale, kinds."""
+"""Name, risk, change of the state; whether the reference reads the changed state; float64 error, scale, kinds."""
 
 
 def _in_all_kinds(name: str, risk: str, reference: str, unit: str, **limits):

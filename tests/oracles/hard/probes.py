@@ -1,4 +1,4 @@
-"""What is hard for probes: edges, medial axes, grazing contacts, deep overlap, ties, trembling, thin and sharp meshes."""
+"""Hard cases of probes: edges, medial axes, grazing contacts, deep overlap, ties, jitter, thin and sharp meshes."""
 
 from collections.abc import Callable
 from functools import partial
@@ -58,7 +58,7 @@ HARD: dict[str, list[Place]] = {
     ],
     '<geom type="plane" size="1 1 .1"/>': [((0.3, 0.2, 0), R), ((0, 0, 0.004), 0.006), ((0, 0, -0.03), 0.04)],
 }
-"""By a geom's MJCF: places [m], and how deep a probe there is in the geom [m]."""
+"""By a geom's MJCF: positions of probes [m] and their depths in the geom [m]."""
 GEOMS = {geom.split('"')[1]: geom for geom in HARD}
 """Geoms by the names of their shapes."""
 BY_HAND = "geometry, by hand"
@@ -66,20 +66,20 @@ hard = partial(case.hard, "probes and shapes")
 
 
 JITTER = 1e-9
-"""What a solver leaves of motion at rest [m, and of a unit quaternion]."""
+"""Residual motion of a solver at rest [m, and of a unit quaternion]."""
 NUM_STEPS = 10_000
-"""Steps that tests look at."""
+"""Steps that tests evaluate."""
 
 
 def repeated(scene: SceneState, num: int) -> SceneState:
-    """Return an environment many times over."""
+    """Return an environment repeated many times."""
     names = ("body_pos", "body_quat", "body_linvel", "body_angvel", "contact_found")
     values: dict[str, Any] = {name: getattr(scene, name) for name in names}
     return SceneState(**{k: v.expand(num, *v.shape[1:]).clone() for k, v in values.items() if v is not None})
 
 
 def jittered(scene: SceneState, num: int, seed: int = 0) -> SceneState:
-    """Return as many steps of a scene at rest, all poses trembling."""
+    """Return `num` steps of a scene at rest with jittering poses."""
     steps = repeated(scene, num)
     generator = torch.Generator().manual_seed(seed)
     assert steps.body_pos is not None and steps.body_quat is not None
@@ -170,7 +170,7 @@ SHAPES_OF_ONE = (
 
 @hard("primitives of {scale:g} m", "squares underflow or overflow", "float64 definition", "of the size", each=[1e-6, 1e-3, 1e3])
 def sizes(dtype: torch.dtype, scale: float):
-    """Places nearer to a tie than 1e-7 m count as on it, whatever the size: below 1 mm errors may be twice as much."""
+    """Points closer than 1e-7 m to a tie count as on it, whatever the size: below 1 mm, errors may be twice as large."""
     draws = np.random.default_rng(3).uniform(-1.5, 1.5, (2, len(SHAPES_OF_ONE), 200, 3))[int(dtype == torch.float32)]
     errors = []
     for (shape, sides), draw in zip(SHAPES_OF_ONE, draws, strict=True):
@@ -211,14 +211,14 @@ def plate() -> trimesh.Trimesh:
 
 
 def needles() -> trimesh.Trimesh:
-    """Return a wedge 40 mm long whose sides are triangles as thin as 1 to 4,000."""
+    """Return a wedge 40 mm long with triangles as thin as 1 to 4,000."""
     low = np.array([[0, 0, 0], [0.04, 0, 0], [0.04, 1e-5, 0]])
     faces = [[2, 1, 0], [3, 4, 5], [0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5]]
     return trimesh.Trimesh(np.concatenate([low, low + [0, 0, 0.02]]), faces, process=False)
 
 
 def twins() -> trimesh.Trimesh:
-    """Return two boxes that share a face, both of whose copies are there."""
+    """Return two boxes that share a face, with both copies of it."""
     parts = [trimesh.creation.box((0.02, 0.02, 0.02)).apply_translation((x, 0, 0)) for x in (-0.01, 0.01)]
     return trimesh.util.concatenate(parts)
 
@@ -229,9 +229,9 @@ MESHES: dict[str, tuple[Callable[[], trimesh.Trimesh], Probes]] = {
     "needles": (needles, [(0.03, -0.003, 0.01), (0.03, 0.004, 0.01), (0.042, 0.0, 0.01), (0.0425, 0.0, 0.022)]),
     "twins": (twins, [(0.0, 0.004, 0.013), (0.0, 0.013, 0.0), (0.003, 0.002, 0.014), (0.0215, 0.0115, 0.0115)]),
 }
-"""The mesh, and probes beside it: over its middle, its edges and its corners [m]."""
+"""The mesh, and probes near it: over its middle, its edges and its corners [m]."""
 TOLERANCE = 1e-4
-"""Of distance grids around them [m]."""
+"""Tolerance of distance grids around them [m]."""
 
 
 @hard(
@@ -247,5 +247,5 @@ def hard_meshes(dtype: torch.dtype, part: tuple[Callable[[], trimesh.Trimesh], P
         touch, scene = mesh_scene(make(), np.array(probes), geoms=geoms, dtype=dtype, **fields)
         depth = touch(scene)["s"][0, :, 0].double().numpy()
     exact = np.maximum(R - brute_force(np.asarray(make().triangles), np.array(probes))[0], 0)
-    # Near creases a grid is held to five times its tolerance.
+    # Near creases a grid may err by five times its tolerance.
     return Errors(np.abs(depth - exact).max(), 5 * TOLERANCE if query == "sdf" else 1e-6)

@@ -28,7 +28,7 @@ STRUCK: Mapping[str, Any] = {
     "samples": 32,
     "scrape": 0.0,
 }
-"""A sounding body without noise, whose normal numbers are series in float64."""
+"""A sounding body without noise, because float64 noise is computed by series."""
 SENSORS: Mapping[str, Mapping[str, Any]] = {
     "elastomer": {"standoff": 0.003, "friction": 0.6},
     "proximity": {"tolerance": 0.04},
@@ -39,7 +39,7 @@ SENSORS: Mapping[str, Mapping[str, Any]] = {
     "actuation_audio": {"joints": ["wheel"], "samples": 8, "friction": 0.0},
     "microphone": {"body": "palm", "pos": [0.01, 0.0, 0.02], "speed": 100.0, "reach": 5.0, "nearest": 0.02},
 }
-"""Fields of kinds whose defaults are not what is tried, or that need some."""
+"""Fields of kinds that differ from the defaults or are required."""
 READ: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "microphone": {"struck": {"kind": "contact_audio", "links": list(LINKS), "feels": list(OBJECTS), **STRUCK}}
 }
@@ -49,7 +49,7 @@ HEAT: Mapping[str, Mapping[str, Any]] = {
     "tool": {"material": "rubber", "temperature": -5.0},
     "floor": {"material": "wood"},
 }
-"""What objects are made of, for kinds that conduct heat."""
+"""Materials of objects, for kinds that conduct heat."""
 SCENE = """
 <mujoco model="hard">
   <worldbody>
@@ -71,7 +71,7 @@ SCENE = """
 </mujoco>
 """
 INERTIA = '<inertial pos="0 0 0" mass=".1" diaginertia="1e-4 1e-4 1e-4"/>'
-"""Of every body, whatever its size."""
+"""Mass of every body, whatever its size."""
 MILLIMETRES = (8, 10, 12, 15, 16, 20, 25, 30, 35)
 
 
@@ -80,7 +80,7 @@ class Pair(NamedTuple):
 
     Attributes:
         module: The module.
-        reference: The same by the kind's float64 definition.
+        reference: The module by the kind's float64 definition.
     """
 
     module: TactileModule
@@ -89,7 +89,7 @@ class Pair(NamedTuple):
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Leave out warnings of what hard cases do on purpose: taxels that nothing could touch, more contacts than slots, poses that are no numbers."""
+    """Ignore warnings that hard cases provoke: unreachable taxels, more contacts than slots, non-finite poses."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnfeltWarning)
         warnings.filterwarnings("ignore", "contacts of ")
@@ -99,7 +99,7 @@ def quiet() -> Iterator[None]:
 
 
 def taxels(num: int, seed: int, scale: float = 1.0) -> list[dict[str, Any]]:
-    """Return taxels all over a link-sized ball, some of them inactive; lengths times a scale."""
+    """Return taxels all over a link-sized ball, some inactive; lengths are multiplied by a scale."""
     rng = np.random.default_rng(seed)
     ways = rng.normal(size=(num, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
@@ -140,7 +140,7 @@ def _planned(kind: str, scale: float) -> tuple[Plan, Mapping[str, Any]]:
 
 
 def pair_of(kind: str, dtype: torch.dtype, scale: float = 1.0) -> Pair:
-    """Return a kind's module and its reference at the start of an episode; all lengths of the scene times a scale."""
+    """Return a kind's module and its reference at the start of an episode; all lengths are multiplied by a scale."""
     plan, specs = _planned(kind, scale)
     kinds = {known.name: known for known in KINDS}
     read = {name: (kinds[fields["kind"]], specs[name]) for name, fields in READ.get(kind, {}).items()}
@@ -150,14 +150,14 @@ def pair_of(kind: str, dtype: torch.dtype, scale: float = 1.0) -> Pair:
 
 @functools.lru_cache(maxsize=64)
 def _answers_of(kind: str, scale: float) -> dict[bytes, Any]:
-    """Return what the reference has answered so far: both precisions ask it the same."""
+    """Return the cache of the reference's answers, which both precisions share."""
     return {}
 
 
 def worst_of(pair: Pair, state: SceneState, truth: SceneState | None = None, enough: float = 0.0) -> float:
-    """Return the largest error of a reading over full scale, infinite where it alone is not finite.
+    """Return the largest error of a reading over full scale; infinite if only the reading is not finite.
 
-    The reference reads `truth`, or the same state. Errors up to `enough` need no look at the other sides of ties.
+    The reference reads `truth`, or the same state. Errors up to `enough` need no check of the other sides of ties.
     """
     with quiet():
         errors = row_errors(pair.module(state)["s"], pair.reference, truth or state, enough)

@@ -1,1 +1,1 @@
-"""Scenes, signals and states that oracles and hard cases are computed on."""
+"""Scenes, signals and states of oracles and hard cases."""

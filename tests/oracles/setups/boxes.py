@@ -1,4 +1,4 @@
-"""Boxes that touch as they are told to: a module of temperatures, and states with contacts that are made up.
+"""Boxes with made-up contacts: a module of temperatures and its states.
 
 Shapes: `env` environments, `link` links, `x`, `y`, `z` cells.
 """
@@ -22,7 +22,7 @@ def heat_module(
     folder: Path, links: Mapping[str, Sequence[Any]], sensor: Mapping[str, Any],
     objects: Mapping[str, tuple[Sequence[Any] | None, Mapping[str, Any]]] | None = None, dtype: torch.dtype = torch.float64,
 ) -> TactileModule:  # fmt: skip
-    """Return a module with one sensor, `heat`, on boxes with sides [m]; objects have sides, None for a plane, and fields."""
+    """Return a module with one sensor, `heat`, on boxes with sides [m]; objects have sides (None: a plane) and fields."""
     objects, bodies = objects or {}, []
     for name, sides in {**links, **{name: sides for name, (sides, _) in objects.items()}}.items():
         if sides is None:
@@ -71,7 +71,7 @@ def heat_state(
 def face_contacts(
     sides: Sequence[Any], height: float, normal: Sequence[Any] = (0, 0, 1), force: float | int = 1.0
 ) -> list[Contact]:
-    """Return contacts at the corners of a rectangle across z, about the origin, at a height [m]."""
+    """Return contacts at the corners of a centred rectangle across z, at a height [m]."""
     x, y = 0.5 * sides[0], 0.5 * sides[1]
     return [((sx * x, sy * y, height), normal, force) for sx, sy in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
 
@@ -82,7 +82,7 @@ def cells_of(module: TactileModule) -> torch.Tensor:
 
 
 def begin(module: TactileModule, state: SceneState, above: np.ndarray | None = None) -> None:
-    """Read once, so that the episode has begun, and set temperatures of the first link [K]."""
+    """Read once to start the episode, and set temperatures of the first link [K]."""
     module(state)
     if above is not None:
         cells_of(module)[:, 0] = torch.as_tensor(above, dtype=cells_of(module).dtype)

@@ -4,7 +4,7 @@ import numpy as np
 
 
 def solid_angles(corners, points):
-    """Signed solid angle of each triangle seen from each point (Van Oosterom and Strackee)."""
+    """Return the signed solid angle of each triangle from each point (Van Oosterom and Strackee)."""
     a, b, c = (corners[None, :, k] - points[:, None] for k in range(3))
     la, lb, lc = (np.linalg.norm(part, axis=-1) for part in (a, b, c))
     volume = (a * np.cross(b, c)).sum(-1)
@@ -13,13 +13,13 @@ def solid_angles(corners, points):
 
 
 def to_segment(a, b, points):
-    """Distance of points (n, 1, 3) to segments (f, 3)."""
+    """Return distances of points (n, 1, 3) to segments (f, 3)."""
     along = ((points - a) * (b - a)).sum(-1) / ((b - a) ** 2).sum(-1)
     return np.linalg.norm(points - a - np.clip(along, 0, 1)[..., None] * (b - a), axis=-1)
 
 
 def brute_force(corners, points):
-    """Distance to the nearest of all triangles, and the winding number."""
+    """Return the distance to the nearest triangle, and the winding number."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     p = points[:, None]
     best = np.minimum(np.minimum(to_segment(a, b, p), to_segment(b, c, p)), to_segment(c, a, p))

@@ -1,4 +1,4 @@
-"""A tone that each link emits, and what a microphone hears of it, bodies moving along x.
+"""A tone that each link emits, and a microphone that hears it while bodies move along x.
 
 Shapes: `env` environments, `sample` samples, `row` rows of a sensor.
 """
@@ -57,7 +57,7 @@ class ToneSpec(LinkSpec):
 def reference(
     spec: ToneSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Return the samples, and where they come from."""
+    """Return the samples and the positions of their sources."""
     rows, count = len(layout.bodies), np.arange(1, spec.samples + 1)
     time = context.time - context.dt + count * context.dt / spec.samples
     rate = 2 * np.pi * spec.frequency * (1 + 0.3 * np.arange(rows))
@@ -80,7 +80,7 @@ def lower(spec: ToneSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
 
 
 def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
-    """Return the samples, and where they come from."""
+    """Return the samples and the positions of their sources."""
     time = context.time.double() + constants["share"].double() * context.dt.double()
     phase = time[:, :, None] * constants["rate"].double()
     made = constants["amplitude"] * (torch.sin(phase) * (time >= 0)[:, :, None]).to(context.time.dtype)
@@ -100,7 +100,7 @@ SCENE = """<mujoco><option timestep=".001" gravity="0 0 0"/><worldbody>
 RATE, SPEED = 20000.0, 343.0
 """Sample rate [Hz] and speed of sound [m/s]."""
 PITCH = 3000.0
-"""Of the tone, if no other is given [Hz]."""
+"""Default frequency of the tone [Hz]."""
 
 
 def listening(
@@ -119,10 +119,10 @@ def heard(
     touch: TactileModule, steps: int, source: Any = (0.0, 0, 0), listener: Any = (0.0, 0, 0), speeds: Any = (0.0, 0.0),
     names: Sequence[str] = ("mic",),
 ) -> Any:  # fmt: skip
-    """Return all samples of some sensors, bodies moving along x from where they begin [m, m/s].
+    """Return all samples of some sensors while bodies move along x from their starts [m, m/s].
 
-    Of several environments, whose source, listener or speeds are lists, (env, sample, row); of one (sample, row), and of a
-    microphone alone without the row.
+    Shape: (env, sample, row) if source, listener or speeds are lists over environments, otherwise (sample, row), or
+    (sample,) for a microphone.
     """
     source, listener, speeds = (np.atleast_2d(np.asarray(value, dtype=np.float64)) for value in (source, listener, speeds))
     num = max(len(source), len(listener), len(speeds))
@@ -150,5 +150,5 @@ def frequency_of(samples: np.ndarray) -> float:
 
 
 def away(distances: Any) -> np.ndarray:
-    """Return places at some distances along x [m]."""
+    """Return positions at these distances along x [m]."""
     return np.outer(distances, [1.0, 0, 0])

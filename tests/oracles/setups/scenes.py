@@ -32,19 +32,19 @@ HERE = "{folder}"
 
 @contextmanager
 def folder() -> Iterator[Path]:
-    """Yield a folder for a scene's files that is gone afterwards."""
+    """Yield a temporary folder for a scene's files."""
     with TemporaryDirectory(prefix="tgdsl-") as name:
         yield Path(name)
 
 
 def temporary(build: Callable[..., Any], *arguments: Any, **fields: Any) -> Any:
-    """Return what a function builds in a folder, its first argument, that is removed afterwards."""
+    """Return the result of a function whose first argument is a temporary folder."""
     with folder() as where:
         return build(where, *arguments, **fields)
 
 
 def compiled(document: Mapping[str, Any], dtype: torch.dtype = torch.float64) -> TactileModule:
-    """Return a document's module; its poses are made up, so that taxels which nothing could touch are no mistake."""
+    """Return a document's module without warnings of unreachable taxels, because poses are made up."""
     model = Path(document["robot"]["model"])
     files = tuple((file.name, file.read_bytes()) for file in sorted(model.parent.iterdir()) if file.is_file())
     text = json.dumps(document, default=lambda value: value.tolist()).replace(str(model.parent), HERE)
@@ -53,7 +53,7 @@ def compiled(document: Mapping[str, Any], dtype: torch.dtype = torch.float64) ->
 
 @functools.lru_cache(maxsize=64)
 def _plan_of(document: str, files: tuple[tuple[str, bytes], ...]) -> Plan:
-    """Return the plan of a document as JSON with the files beside its model, whose folder it calls `HERE`."""
+    """Return the plan of a document as JSON with the files next to its model, in a folder called `HERE`."""
     with folder() as where, warnings.catch_warnings():
         warnings.simplefilter("ignore", UnfeltWarning)
         warnings.simplefilter("ignore", CoarseCellsWarning)  # some cases are about coarse cells
@@ -63,7 +63,7 @@ def _plan_of(document: str, files: tuple[tuple[str, bytes], ...]) -> Plan:
 
 
 def points(places: Sequence[Point] | np.ndarray, radius: float, normal: Point = (0, 0, 1)) -> dict[str, Any]:
-    """Return a link's layout: probes at some places [m], of one radius [m] and one normal."""
+    """Return a link's layout: probes at these positions [m] with one radius [m] and one normal."""
     rows = [{"pos": [float(part) for part in pos], "normal": list(normal), "radius": radius} for pos in places]
     return {"method": "points", "points": rows}
 
@@ -82,7 +82,7 @@ def module(
     if mesh is not None:
         mesh.copy().apply_scale(1 / scale).export(where / "item.stl")
         asset = f'<asset><mesh name="item" file="item.stl" scale="{scale} {scale} {scale}" inertia="shell"/></asset>'
-    joint = "" if "plane" in geom else "<freejoint/>"  # MuJoCo allows planes in static bodies only
+    joint = "" if "plane" in geom else "<freejoint/>"  # MuJoCo allows planes only in static bodies
     (where / "scene.xml").write_text(
         f'<mujoco><compiler balanceinertia="true"/>{asset}<worldbody><body name="pad"><freejoint/><geom size=".05"/></body>'
         f'<body name="item">{joint}{geom}</body></worldbody></mujoco>',
@@ -107,7 +107,7 @@ def probed(probes: Sequence[Point] | np.ndarray, geom: str, **sensor: Any) -> Ta
 
 
 def state(touch: TactileModule, **item: Any) -> SceneState:
-    """Return a state with everything at rest at the origin, but for what is said of the item: pos, quat, linvel, angvel."""
+    """Return a state at rest at the origin, except the item's given pos, quat, linvel or angvel."""
     rest = {"pos": [0, 0, 0], "quat": [1, 0, 0, 0], "linvel": [0, 0, 0], "angvel": [0, 0, 0]}
     values: dict[str, Any] = {}
     for name, default in rest.items():
@@ -129,10 +129,10 @@ PAD = """
 </mujoco>
 """
 FOOTPRINT = 0.015
-"""Radius of a footprint [m]: half of it reaches from the middle of a cell of the pad to its taxels."""
+"""Radius of a footprint [m]: half of it spans from the middle of a cell of the pad to its taxels."""
 LINE = np.linspace(-0.025, 0.025, 6)
 TAXELS = [(float(x), float(y), 0.01) for x in LINE for y in LINE]
-"""Places of the pad's taxels [m]."""
+"""Positions of the pad's taxels [m]."""
 
 
 def pad(
@@ -159,7 +159,7 @@ def settled(touch: TactileModule, steps: int = 1500, **options: Any) -> SceneSta
 
 
 def resting(**scene: Any) -> tuple[TactileModule, SceneState]:
-    """Return the module of a `pad` and its state once the cube has settled."""
+    """Return the module of a `pad` and its state after the cube has settled."""
     with folder() as where:
         touch = pad(where, **scene)
         return touch, settled(touch)

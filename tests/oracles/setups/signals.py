@@ -1,4 +1,4 @@
-"""The batched noise alone, fed a signal of one's choice call by call; layouts for crosstalk; distances of distributions.
+"""The batched noise alone, fed any signal call by call; layouts for crosstalk; distances of distributions.
 
 Shapes: `env` environments, `row` taxels, `channel` channels.
 """
@@ -25,7 +25,7 @@ MM = 1e-3
 
 
 def make_layout(pos: np.ndarray, normal: Any = (0, 0, 1), link_id: Any = 0, radius: Any = 4 * MM) -> Layout:
-    """Taxels at the given places (taxel, 3); what is given once holds for all."""
+    """Return taxels at these positions (taxel, 3); single values apply to all."""
     count = len(pos)
     link_id = np.broadcast_to(np.asarray(link_id, dtype=np.int64), count)
     return Layout(
@@ -42,7 +42,7 @@ def make_layout(pos: np.ndarray, normal: Any = (0, 0, 1), link_id: Any = 0, radi
 
 
 def line(count: int) -> Layout:
-    """Taxels 1 mm apart."""
+    """Return taxels 1 mm apart."""
     return make_layout(np.arange(count)[:, None] * np.array([MM, 0, 0]))
 
 
@@ -52,7 +52,7 @@ class ReferenceNoise:
     def __init__(
         self, knobs: Sequence[Knobs], channels: Sequence[str], key: tuple[int, int], env: int = 0, layout: Layout | None = None
     ):
-        """Begin the first episode.
+        """Start the first episode.
 
         Args:
             knobs: The knobs of each row.
@@ -67,21 +67,21 @@ class ReferenceNoise:
         self.reset()
 
     def reset(self) -> None:
-        """Begin a new episode."""
+        """Start a new episode."""
         self._call = replace(self._call, episode=self._call.episode + 1)
         self._memory: dict[str, dict[str, Any]] = {stage.name: {} for stage in self._stages}
 
     @property
     def gain(self) -> np.ndarray:
-        """Each taxel's gain (row, channel)."""
+        """Return each taxel's gain (row, channel)."""
         return Gain.reference(np.ones((len(self._call.ranges), len(self._call.channels))), self._call, {})
 
     def radius(self, radius: np.ndarray) -> np.ndarray:
-        """Return this step's radii of probes with these radii [m]."""
+        """Return this step's disturbed radii [m]."""
         return Radius.reference_radius(radius, self._call)
 
     def read(self, signal: np.ndarray, dt: float, is_sample: bool = True) -> np.ndarray:
-        """Return the disturbed signal, and go on to the next step.
+        """Return the disturbed signal and advance to the next step.
 
         Args:
             signal: The signal, already multiplied by `gain`.
@@ -99,14 +99,14 @@ class ReferenceNoise:
 
 
 class Noise:
-    """The batched noise of one sensor, as a module would run it; what it remembers is NaN at first, so that no use escapes."""
+    """The batched noise of one sensor, as a module runs it; its state starts as NaN to expose any use of it."""
 
     def __init__(
         self, knobs: Mapping[str, Any] | Sequence[Mapping[str, Any]], layout: Layout | int = 1,
         channels: Sequence[str] = ("depth",), *, num_envs: int = 1, dt: float | int = 0.0, seed: int = 0, name: str = "touch",
         first_env: int = 0, dtype: torch.dtype = torch.float64,
     ):  # fmt: skip
-        """Take the knobs of all rows, or of each; `dt` is the shortest one [s], which a ring must hold."""
+        """Take the knobs of all rows, or of each; a ring must hold the shortest step, `dt` [s]."""
         self.layout = line(layout) if isinstance(layout, int) else layout
         count = self.layout.num_taxels
         sets = [Knobs.model_validate(row) for row in ([knobs] if isinstance(knobs, Mapping) else knobs)]
@@ -130,14 +130,14 @@ class Noise:
         return [ReferenceNoise(self._rows, self.channels, self.key, int(env), self.layout) for env in self.env]
 
     def now(self, dt: float | int = 0.0, is_sample: Tensor | None = None) -> Now:
-        """Return the circumstances of the next call."""
+        """Return the context of the next call."""
         step, drawn = torch.full((self.num_envs,), self.step), {}
         if self.lowered.streams:
             (drawn,) = random.streams(torch.tensor([self.key], dtype=torch.int32), self.env, step, self.episode)
         return Now(torch.tensor(dt, dtype=self.dtype), step[:, None], self.age[:, None], self.ages + dt, is_sample, None, drawn)
 
     def read(self, signal: Any, dt: float | int = 0.0, is_sample: Tensor | None = None) -> Tensor:
-        """Return what is read of a signal, which is broadcast to (env, row, channel)."""
+        """Return the reading of a signal, which is broadcast to (env, row, channel)."""
         shape = (self.num_envs, self.layout.num_taxels, len(self.channels))
         signal = torch.as_tensor(signal, dtype=self.dtype).expand(shape).transpose(1, 2)
         now = self.now(dt, is_sample)
@@ -152,13 +152,13 @@ class Noise:
         return signal.transpose(1, 2)
 
     def reset(self, env_ids: Any = slice(None)) -> None:
-        """Begin a new episode in some environments."""
+        """Start a new episode in some environments."""
         self.episode[env_ids] += 1
         self.age[env_ids] = 0
 
 
 def one(noise: Noise, signal: Sequence[Any], dt: float | int) -> np.ndarray:
-    """Return what one environment's only channel reads of a signal over time, the same in all its rows (call, row)."""
+    """Return readings (call, row) of one environment and channel for a signal over time, equal in all rows."""
     return np.stack([noise.read(value, dt)[0, :, 0].numpy() for value in signal])
 
 
@@ -179,15 +179,15 @@ def _distance(quantiles: np.ndarray) -> float:
 
 
 KOLMOGOROV = 2.7
-"""Of √N times that distance: beyond it with a chance of 2 exp(−2 · 2.7²) = 1e-6, as 5 standard errors of a normal number."""
+"""Limit of √N times that distance: exceeded with probability 2 exp(−2 · 2.7²) = 1e-6, like 5 standard errors."""
 
 
 def correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Return √N times the correlation of two samples: a normal number of variance 1 if they are independent."""
+    """Return √N times the correlation of two samples: normal with variance 1 if they are independent."""
     a, b = a.ravel() - a.mean(), b.ravel() - b.mean()
     return math.sqrt(a.size) * float((a @ b) / math.sqrt((a @ a) * (b @ b)))
 
 
 def standard_errors(estimate: float | int, expected: float | int, error: float | int) -> float:
-    """Return how many standard errors a number is from what is expected."""
+    """Return the deviation from the expected value in standard errors."""
     return abs(estimate - expected) / error

@@ -11,7 +11,7 @@ from tgdsl.surfaces.surface import Surface
 
 
 def surface_of(*meshes: trimesh.Trimesh) -> Surface:
-    """Return the triangles of meshes, each a geom `g0`, `g1`, … of a mesh `mesh0` and so on."""
+    """Return the triangles of meshes: geom `g0` of mesh `mesh0` and so on."""
     parts = [
         Surface(np.array(mesh.vertices), np.array(mesh.faces), np.zeros(len(mesh.faces), int), ((f"g{i}", f"mesh{i}"),))
         for i, mesh in enumerate(meshes)
@@ -80,7 +80,7 @@ def bending(x: np.ndarray | float, number: int) -> np.ndarray:
 def timoshenko(length: float, height: float, width: float, poissons_ratio: float, below: float) -> list[float]:
     """Return ω of a free–free beam's bending across its height by Timoshenko's theory, with E = 1 and ρ = 1.
 
-    Both parts of the deflection, cosh or cos of αs and cos of βs for even and sinh, sin for odd modes about the middle, leave
+    Both parts of the deflection, cosh or cos of αs and cos of βs for even and sinh, sin for odd modes about the middle, keep
     the ends free of moment and shear. Shear coefficient κ = 10(1 + ν)/(12 + 11ν) (Cowper 1966).
     """
     area, inertia = width * height, width * height**3 / 12

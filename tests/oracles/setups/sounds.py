@@ -1,4 +1,4 @@
-"""What makes sound: a plate that a ball presses, rubs or falls on, and a motor's joint.
+"""Sources of sound: a plate that a ball presses, rubs or falls on, and a motor's joint.
 
 Shapes: `step` physics steps, `env` environments, `sample` samples of all steps.
 """
@@ -36,7 +36,7 @@ MODES: list[dict[str, float]] = [
     {"frequency": 1171.0, "decay": 20.0, "gain": -1.0},
     {"frequency": 2903.0, "decay": 55.0, "gain": 0.7},
 ]
-"""The plate's, if no others are given."""
+"""Default modes of the plate."""
 MOTOR = """
 <mujoco>
   <option timestep="0.001"/>
@@ -65,7 +65,7 @@ def pressed(
 ) -> SceneState:
     """Return the state of a ball in each environment that presses with a normal force [N], sliding at a speed [m/s].
 
-    It lies turned, and the plate moves along and turns, so that only what is relative counts.
+    The contact is tilted, and the plate moves and turns, so only relative motion counts.
     """
     forces, speeds = torch.as_tensor(force, dtype=torch.float64), torch.as_tensor(speed, dtype=torch.float64)
     state = touch.example_state(len(forces))
@@ -83,7 +83,7 @@ def pressed(
 
 
 def sound(touch: TactileModule, forces: Any, speeds: Any = 0.0, step: float = STEP) -> Float[np.ndarray, "env sample"]:
-    """Return what is heard of normal forces (step, env) [N] and sliding speeds [m/s], one after the other [m/s]."""
+    """Return the sound [m/s] of successive normal forces (step, env) [N] and sliding speeds [m/s]."""
     forces = np.atleast_2d(np.asarray(forces, dtype=np.float64).T).T
     speeds = np.broadcast_to(np.asarray(speeds, dtype=np.float64), forces.shape)
     heard = [touch(pressed(touch, f.tolist(), v.tolist(), step))["s"][:, :, 0, 0] for f, v in zip(forces, speeds, strict=True)]
@@ -130,7 +130,7 @@ def struck(
 
 
 def motor(folder: Path, dtype: torch.dtype | str = torch.float64, **fields: Any) -> TactileModule:
-    """Return a module that hears a joint, `elbow`, in `motors`: only the parts of its sound whose levels are given."""
+    """Return a module that hears a joint, `elbow`, in `motors`: only parts of its sound with given levels."""
     (folder / "motor.xml").write_text(MOTOR, encoding="utf-8")
     parts = {"load": 0.0, "power": 0.0, "friction": 0.0, "hum": 0.0}
     sensor = {"kind": "actuation_audio", "joints": ["elbow"], "samples": 20, **parts, **fields}
@@ -141,7 +141,7 @@ def motor(folder: Path, dtype: torch.dtype | str = torch.float64, **fields: Any)
 def driven(
     touch: TactileModule, velocities: Sequence[float | int] | np.ndarray, efforts: Any, num_envs: int = 1
 ) -> Float[np.ndarray, "env sample"]:
-    """Return all samples of a joint whose velocity [rad/s] and effort [N·m] are given at each step [Pa]."""
+    """Return all samples [Pa] of a joint with these velocities [rad/s] and efforts [N·m] per step."""
     state, blocks = touch.example_state(num_envs), []
     one = torch.ones_like(state.joint_vel)
     for velocity, effort in zip(velocities, np.broadcast_to(efforts, len(velocities)), strict=True):
@@ -151,7 +151,7 @@ def driven(
 
 
 MASS, GRAVITY = 0.05, 9.81
-"""Of the ball [kg, m/s²]."""
+"""Mass of the ball and gravity [kg, m/s²]."""
 DROPS = """
 <mujoco>
   <option timestep="{step}" integrator="implicitfast" cone="elliptic"/>
@@ -162,7 +162,7 @@ DROPS = """
 </mujoco>
 """
 HEIGHTS = np.array([0.005, 0.01, 0.02, 0.04, 0.08, 0.16])
-"""Of the ball's lowest point above the plate [m]."""
+"""Heights of the ball's lowest point above the plate [m]."""
 
 
 def dropped(
@@ -182,7 +182,7 @@ def dropped(
 
 
 def loudest(sim: Any, touch: TactileModule, seconds: float) -> tuple[Float[np.ndarray, " env"], Float[np.ndarray, " env"]]:
-    """Return of each environment the amplitude of its first mode after its first collision, and that one's impulse [N·s]."""
+    """Return each environment's amplitude of the first mode after its first collision, and that collision's impulse [N·s]."""
     largest, impulse = np.zeros((2, sim.num_envs))
     is_over, is_next = np.zeros((2, sim.num_envs), dtype=bool)
     for _ in range(round(seconds / sim.model.opt.timestep)):
