@@ -167,7 +167,7 @@ def test_a_command_shows_progress_on_a_terminal(folder):
     with os.fdopen(master, "rb", buffering=0) as screen:
         with os.fdopen(terminal, "wb") as out:
             process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=out, text=True)
-        shown = b""
+        drawn = b""
         while True:
             try:
                 part = screen.read(4096)
@@ -175,10 +175,10 @@ def test_a_command_shows_progress_on_a_terminal(folder):
                 break
             if not part:
                 break
-            shown += part
+            drawn += part
         output, _ = process.communicate()
-    assert process.returncode == 0, shown
-    text = shown.decode()
+    assert process.returncode == 0, drawn
+    text = drawn.decode()
     for message in (
         "object item: distances",
         "starting the simulation",

@@ -212,14 +212,14 @@ def test_changed_arrays_are_refused(artifact, tmp_path):
     arrays = load(content)
     header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]
     changed = {**arrays, REACH: arrays[REACH] * 2}
-    lacking = {name: value for name, value in arrays.items() if name != REACH}
-    half = {**arrays, REACH: arrays[REACH].astype(np.float16)}
+    without_reach = {name: value for name, value in arrays.items() if name != REACH}
+    with_other_dtype = {**arrays, REACH: arrays[REACH].astype(np.float16)}
     for bad in (
         changed,
-        lacking,
-        {**lacking, "quantities/reach": arrays[REACH]},
+        without_reach,
+        {**without_reach, "quantities/reach": arrays[REACH]},
         {**arrays, "quantities/reach": arrays[REACH]},
-        half,
+        with_other_dtype,
     ):
         (tmp_path / "bad.safetensors").write_bytes(save(bad, header))
         assert refusal_of(tmp_path / "bad.safetensors") == "the arrays differ from the arrays that the plan was written with"

@@ -40,5 +40,5 @@ def test_a_nearest_search_over_more_triangles_takes_more():
     few = TriangleMesh(corners, torch.tensor(faces).numpy())
     many = TriangleMesh(corners, torch.tensor(faces * 64).numpy())
     point = (torch.zeros(9),) * 3
-    one, two = (num_operations(lambda mesh=mesh: nearest(point, [mesh], 1.0)) for mesh in (few, many))
-    assert 9 * 100 < one < two < 9 * 10000
+    num_few, num_many = (num_operations(lambda mesh=mesh: nearest(point, [mesh], 1.0)) for mesh in (few, many))
+    assert 9 * 100 < num_few < num_many < 9 * 10000

@@ -74,7 +74,7 @@ def write(folder: Path, release: str) -> None:
     (folder / "scene.xml").write_text(SCENE)
     touch = tgdsl.compile(DOCUMENT | {"robot": DOCUMENT["robot"] | {"model": str(folder / "scene.xml")}})
     tgdsl.save(touch, KEPT / f"{release}.safetensors")
-    sim, kept = tgdsl.simulate(touch, num_envs=2), {}
+    sim, arrays = tgdsl.simulate(touch, num_envs=2), {}
     for _ in range(3):
         sim.step()
         state = sim.state()
@@ -82,10 +82,10 @@ def write(folder: Path, release: str) -> None:
         results = readings | {f"observed {name}": values for name, values in touch.observe(readings).items()}
         for name in touch.inputs.fields:
             if isinstance(value := getattr(state, name), torch.Tensor):
-                kept.setdefault(f"state:{name}", []).append(value.numpy().copy())
+                arrays.setdefault(f"state:{name}", []).append(value.numpy().copy())
         for name, values in results.items():
-            kept.setdefault(f"result:{name}", []).append(values.float().numpy().copy())
-    np.savez_compressed(KEPT / f"{release}.npz", **{name: np.stack(values) for name, values in kept.items()})
+            arrays.setdefault(f"result:{name}", []).append(values.float().numpy().copy())
+    np.savez_compressed(KEPT / f"{release}.npz", **{name: np.stack(values) for name, values in arrays.items()})
 
 
 if __name__ == "__main__":

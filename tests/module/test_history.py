@@ -80,14 +80,14 @@ def test_a_history_keeps_the_gradient_of_its_last_call(build, reduce):
     state.body_pos.requires_grad_()
     total = touch.peek(state)["s"][..., 0, 0].sum()
     (slope,) = torch.autograd.grad(total, state.body_pos)
-    step, place = 1e-6, (0, touch.inputs.bodies.index("item"), 2)
+    step, index = 1e-6, (0, touch.inputs.bodies.index("item"), 2)
     values = []
     for sign in (1, -1):
         moved = state.body_pos.detach().clone()
-        moved[place] += sign * step
+        moved[index] += sign * step
         values.append(touch.peek(SceneState(body_pos=moved, body_quat=state.body_quat))["s"][..., 0, 0].sum().item())
-    assert slope[place].item() == pytest.approx((values[0] - values[1]) / (2 * step), rel=1e-6)
-    assert slope[place].item() == pytest.approx({"stack": -1, "mean": -1 / 3, "median": -1}[reduce], rel=1e-6)
+    assert slope[index].item() == pytest.approx((values[0] - values[1]) / (2 * step), rel=1e-6)
+    assert slope[index].item() == pytest.approx({"stack": -1, "mean": -1 / 3, "median": -1}[reduce], rel=1e-6)
 
 
 def test_a_stack_is_channel_major_per_call(build):

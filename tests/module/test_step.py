@@ -30,8 +30,10 @@ def test_steps_read_the_same_as_calls(noisy):
         assert all(torch.equal(readings[name], expected[name]) for name in expected)
         assert all(torch.equal(memory[name], before[name]) for name in before)
         memory = after
-    held = noisy.memory.tensors(4, 0.01, noisy.dtype, noisy.device)
-    assert held.keys() == memory.keys() and all(torch.equal(held[name], memory[name]) for name in held)
+    module_memory = noisy.memory.tensors(4, 0.01, noisy.dtype, noisy.device)
+    assert module_memory.keys() == memory.keys() and all(
+        torch.equal(module_memory[name], memory[name]) for name in module_memory
+    )
 
 
 def test_steps_of_every_kind_read_the_same_as_calls():
@@ -60,12 +62,12 @@ def test_gradients_flow_through_memory(tmp_path, noise, history):
     pos = states[0].body_pos.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(last(pos), pos)
     steepest = gradient.abs().flatten().topk(3).indices
-    for place in [tuple(map(int, index)) for index in zip(*torch.unravel_index(steepest, pos.shape), strict=True)]:
+    for element in [tuple(map(int, index)) for index in zip(*torch.unravel_index(steepest, pos.shape), strict=True)]:
         shift = torch.zeros_like(pos)
-        shift[place] = 1e-7
+        shift[element] = 1e-7
         difference = (last(pos.detach() + shift) - last(pos.detach() - shift)) / 2e-7
         assert abs(difference) > 1e-3
-        assert difference.item() == pytest.approx(gradient[place].item(), rel=1e-5, abs=1e-5)
+        assert difference.item() == pytest.approx(gradient[element].item(), rel=1e-5, abs=1e-5)
 
 
 def test_invalid_memory_is_refused(noisy):

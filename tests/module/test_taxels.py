@@ -45,7 +45,7 @@ def compiled(folder, points=POINTS, noise="clean") -> tgdsl.TactileModule:
     })  # fmt: skip
 
 
-def near(points=POINTS):
+def rounded_points(points=POINTS):
     """Return the same points 1e-8 m away, as after a conversion to float32."""
     return [{**point, "pos": [x + 1e-8 for x in point["pos"]]} for point in points]
 
@@ -53,7 +53,7 @@ def near(points=POINTS):
 @pytest.fixture
 def three(tmp_path):
     """Return a module, the same one within rounding, and one with two rows swapped."""
-    return compiled(tmp_path), compiled(tmp_path, near()), compiled(tmp_path, [POINTS[i] for i in (0, 2, 1)])
+    return compiled(tmp_path), compiled(tmp_path, rounded_points()), compiled(tmp_path, [POINTS[i] for i in (0, 2, 1)])
 
 
 def test_taxels_are_checked_against_modules_and_tables(three):
@@ -133,7 +133,7 @@ def test_taxels_are_checked_when_a_state_is_loaded(tmp_path, noise):
             super().__init__()
             self.touch, self.layer = touch, nn.Linear(9, 2)
 
-    policy, same, other = (Policy(compiled(tmp_path, points, noise)) for points in (POINTS, near(), POINTS[::-1]))
+    policy, same, other = (Policy(compiled(tmp_path, points, noise)) for points in (POINTS, rounded_points(), POINTS[::-1]))
     state = policy.touch.example_state(2)
     policy.touch(state)
     torch.save(policy.state_dict(), tmp_path / "policy.pt")

@@ -30,16 +30,16 @@ def sample_indices(dts, rate) -> list[int]:
 
     The k-th sample is due k/rate after the first call, and taken at the call within half a step of that.
     """
-    read, time, taken = [], Fraction(0), -1
+    indices, time, last_sample = [], Fraction(0), -1
     for i, dt in enumerate(map(Fraction, dts)):
         time += dt if i else 0
         due = 0 if i == 0 else int((time + dt / 2) * Fraction(rate))
-        if due > taken:
-            taken = due
-            read.append(i)
+        if due > last_sample:
+            last_sample = due
+            indices.append(i)
         else:
-            read.append(read[-1])
-    return read
+            indices.append(indices[-1])
+    return indices
 
 
 # rate
@@ -58,14 +58,14 @@ def test_the_phase_does_not_drift(build, rate, dt, every):
     """Over 10⁵ calls in float32, every sample is taken at the right call."""
     touch = build(torch.float32, s={"rate": rate})
     memory = touch.memory.tensors(1, dt, touch.dtype, touch.device)
-    phase, step, taken = torch.zeros(1), torch.tensor(dt), []
+    phase, step, sampled_calls = torch.zeros(1), torch.tensor(dt), []
     for call in range(100_000):
         now = touch.memory.clock.nows({**memory, "clock/age": torch.tensor([call]), "s:sample/phase": phase}, step)["s"]
         assert now.is_sample is not None and now.period is not None
         if now.is_sample.item():
-            taken.append(call)
+            sampled_calls.append(call)
         phase = _phase(phase, now.period, now)
-    assert taken == list(range(0, 100_000, every))
+    assert sampled_calls == list(range(0, 100_000, every))
 
 
 @pytest.mark.parametrize("rate", [200, 333, 1000, 1e5])

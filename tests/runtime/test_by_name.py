@@ -88,11 +88,11 @@ def test_no_contacts_leave_all_slots_empty():
 
 def test_is_contact_selects_rows():
     contacts = random_contacts(50, 1)
-    chosen = torch.arange(50) % 3 == 0
-    some = {name: value[chosen] for name, value in contacts.items()}
-    every = torch.ones(len(some["pos"]), dtype=torch.bool)
-    fields = tgdsl.contacts_by_pair(INPUTS, GEOMS, **contacts, is_contact=chosen)
-    expected = tgdsl.contacts_by_pair(INPUTS, GEOMS, **some, is_contact=every)
+    is_contact = torch.arange(50) % 3 == 0
+    chosen_contacts = {name: value[is_contact] for name, value in contacts.items()}
+    all_rows = torch.ones(len(chosen_contacts["pos"]), dtype=torch.bool)
+    fields = tgdsl.contacts_by_pair(INPUTS, GEOMS, **contacts, is_contact=is_contact)
+    expected = tgdsl.contacts_by_pair(INPUTS, GEOMS, **chosen_contacts, is_contact=all_rows)
     assert all(torch.equal(fields[name], expected[name]) for name in FIELDS)
 
 
@@ -143,12 +143,10 @@ def test_an_unlisted_world_body_is_at_rest():
 
 
 def test_bodies_of_one_name_are_refused():
-    inputs, places = Inputs(("body_pos",), ("box",), (), {}, 0), torch.zeros(1, 2, 4)
+    inputs, poses = Inputs(("body_pos",), ("box",), (), {}, 0), torch.zeros(1, 2, 4)
     with pytest.raises(SimulationError, match=re.escape('the scene has 2 bodies "a/box"; give each a unique name')):
-        tgdsl.bodies_by_name(inputs, ["a/box", "a/box"], places[..., :3], places)
+        tgdsl.bodies_by_name(inputs, ["a/box", "a/box"], poses[..., :3], poses)
     with pytest.raises(SimulationError, match="this module reads body_linvel, expected all arguments"):
-        tgdsl.bodies_by_name(Inputs(("body_linvel",), ("box",), (), {}, 0), ["box"], places[:, :1, :3], places[:, :1])
+        tgdsl.bodies_by_name(Inputs(("body_linvel",), ("box",), (), {}, 0), ["box"], poses[:, :1, :3], poses[:, :1])
     with pytest.raises(SimulationError, match="linvel_at is given without angvel"):
-        tgdsl.bodies_by_name(
-            inputs, ["box"], *[places[:, :1, :3], places[:, :1], places[:, :1, :3]], linvel_at=places[:, :1, :3]
-        )
+        tgdsl.bodies_by_name(inputs, ["box"], *[poses[:, :1, :3], poses[:, :1], poses[:, :1, :3]], linvel_at=poses[:, :1, :3])

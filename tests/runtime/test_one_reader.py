@@ -63,7 +63,7 @@ def test_a_closed_simulation_releases_its_module_and_cannot_be_used(tmp_path, si
 @BOTH
 def test_an_unreferenced_simulation_releases_its_module(tmp_path, simulator):
     touch = stateful_module(tmp_path)
-    gc.disable()  # reference cycles would delay its release
+    gc.disable()  # a simulation may be in a reference cycle; the module must collect it on demand
     try:
         for _ in range(3):
             sim = simulator(touch, 2)

@@ -161,22 +161,22 @@ def test_names_of_assets_and_parts_must_be_hashes(project, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["file", "folder", "robots", "chain", "loop"])
-def test_an_asset_that_is_a_symbolic_link_is_refused_before_it_is_opened(project, tmp_path, monkeypatch, kind):
+def test_a_symbolic_link_to_elsewhere_is_refused_before_it_is_opened(project, tmp_path, monkeypatch, kind):
     """The secret has the content that the artefact expects, so a read would go unnoticed."""
     secret = tmp_path / "secret" / "item.stl"
     secret.parent.mkdir()
     secret.write_bytes((project / "item.stl").read_bytes())
-    place = tmp_path / "place"
-    link = place / "item.stl"
+    folder = tmp_path / "place"
+    link = folder / "item.stl"
     if kind == "folder":
-        place.symlink_to(secret.parent)
+        folder.symlink_to(secret.parent)
     else:
-        place.mkdir()
+        folder.mkdir()
         if kind == "chain":
-            (place / "next.stl").symlink_to(secret)
-        link.symlink_to({"chain": place / "next.stl", "loop": link}.get(kind, secret))
+            (folder / "next.stl").symlink_to(secret)
+        link.symlink_to({"chain": folder / "next.stl", "loop": link}.get(kind, secret))
     if kind == "robots":
-        monkeypatch.setattr("tgdsl.scene.scene.robots_folder", lambda: place)
+        monkeypatch.setattr("tgdsl.scene.scene.robots_folder", lambda: folder)
     asset_path = "robots:item.stl" if kind == "robots" else str(link)
     path = crafted(project, tmp_path, lambda scene: scene["assets"][0].update(path=asset_path))
     scene = load_plan(path).scene

@@ -68,7 +68,7 @@ def test_links_that_did_not_collide_still_do_not():
 
 
 def test_colliders_change_only_the_collision_shapes():
-    """Masses, inertias and contact parameters are those of the replaced geoms."""
+    """Masses, inertias and contact parameters equal the replaced geoms'."""
     plain, model = mujoco.MjModel.from_xml_string(SCENE.format(bits="", ball="", more="")), model_with_colliders()
     for field in ("body_mass", "body_inertia", "body_ipos", "body_iquat", "jnt_axis", "qpos0"):
         np.testing.assert_array_equal(getattr(model, field), getattr(plain, field))

@@ -74,18 +74,18 @@ def test_a_fingertip_is_not_drawn_from_behind(tmp_path):
     touch, sim = finger(tmp_path, [1, 0, 0])
     sim.batch.qpos[:, 1] += 0.5  # nothing is touched, so all taxels count
     sim.step()
-    markers, first, chosen = cameras(touch, sim)
-    assert num_in_view(sim, markers, first) == 0
+    markers, facing, chosen = cameras(touch, sim)
+    assert num_in_view(sim, markers, facing) == 0
     layout, pose = touch.plan.layout, Pose(*sim.body_poses(0))
-    most = max(num_in_view(sim, markers, camera_of(view, sim.model, [layout], pose, 1)) for view in VIEWS)
-    assert num_in_view(sim, markers, chosen) >= max(most, 1)
+    most_in_view = max(num_in_view(sim, markers, camera_of(view, sim.model, [layout], pose, 1)) for view in VIEWS)
+    assert num_in_view(sim, markers, chosen) >= max(most_in_view, 1)
 
 
 def test_a_camera_that_shows_enough_is_kept(tmp_path):
     touch, sim = finger(tmp_path, [-1, 0, 0])
-    markers, first, chosen = cameras(touch, sim)
-    assert num_in_view(sim, markers, first) == len(markers.pos)
-    for part, expected in zip(chosen, first, strict=True):
+    markers, facing, chosen = cameras(touch, sim)
+    assert num_in_view(sim, markers, facing) == len(markers.pos)
+    for part, expected in zip(chosen, facing, strict=True):
         np.testing.assert_array_equal(part, expected)
 
 
@@ -278,10 +278,10 @@ def test_run_draws_from_the_given_view(tmp_path, here):
     touch, sim = pad(tmp_path, noise=NOISE)
     sim.step()
     readings = touch(sim.state())
-    whole = [
-        picture(touch, sim, readings, tmp_path / f"{i}.png", view=each).read_bytes() for i, each in enumerate((None, view))
+    pictures = [
+        picture(touch, sim, readings, tmp_path / f"{i}.png", view=angles).read_bytes() for i, angles in enumerate((None, view))
     ]
-    assert whole[0] != whole[1]
+    assert pictures[0] != pictures[1]
     tgdsl.save(touch, tmp_path / "pad.safetensors")
     code, _, error = here(tmp_path, "run", "pad.safetensors", "--seconds", "0.01", "--view", view)
     assert code == 0, error

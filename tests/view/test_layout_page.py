@@ -61,8 +61,8 @@ def test_side_box_and_resolution_move_the_taxels(tmp_path):
         page.react()
         handle = page._discs["left_tip"][1]
         np.testing.assert_allclose(handle.batched_positions[:, 1], -0.008 - LIFT)
-        slider, least, _ = page._bounds[2]
-        slider.value = (least, 16.0)
+        slider, lowest, _ = page._bounds[2]
+        slider.value = (lowest, 16.0)
         page.react()
         assert page._discs["left_tip"][1].batched_positions[:, 2].max() <= 0.016 + 1e-6
         assert discs(page)["left_tip"] == 6  # 4 taxels on 1 cm² of 10 × 15 mm

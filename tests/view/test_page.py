@@ -209,9 +209,9 @@ def test_a_stage_with_nothing_to_draw_keeps_the_previous_one_and_shows_a_problem
     silent = SceneStage(tgdsl.compile(bare))
     changes = [silent]
     with opened(SceneStage(tgdsl.compile(document))) as page:
-        shown = page.stage
+        previous = page.stage
         page.run(lambda: changes.pop() if changes else None, seconds=0.1)
-        assert page.stage is shown
+        assert page.stage is previous
         assert "nothing" in page.panel.problem.content or "to draw" in page.panel.problem.content
     with pytest.raises(TgdslError, match="to draw"):
         Page(SceneStage(tgdsl.compile(bare)), port=8300)

@@ -44,8 +44,8 @@ def touch(tmp_path):
 @pytest.fixture
 def trace(touch):
     trace = TouchTrace(touch, touch.outputs[0], 3)
-    for step, read in enumerate(READ):
-        trace.add(step + 1, {"touch": read})
+    for step, reading in enumerate(READ):
+        trace.add(step + 1, {"touch": reading})
     trace.add(3, {"touch": READ[0]})  # beyond the last step
     return trace
 

@@ -33,8 +33,8 @@ def variants_with(**queries: Query):
 
 def test_a_query_is_the_documents_if_all_objects_use_it():
     """With a bowl by rays and a cup by a grid, it is neither."""
-    assert [way.is_own for way in variants_with(cup=Query(), bowl=Query()).queries] == [True, False]
-    assert [way.is_own for way in variants_with(cup=Query(), bowl=Query(query="raycast")).queries] == [False, False]
+    assert [query.is_own for query in variants_with(cup=Query(), bowl=Query()).queries] == [True, False]
+    assert [query.is_own for query in variants_with(cup=Query(), bowl=Query(query="raycast")).queries] == [False, False]
     assert variants_with(cup=Query()).queries[1].changes == {"objects.cup.query": "raycast"}
     assert variants_with(cup=Query(), bowl=Query()).queries[1].changes == {
         "objects.cup.query": "raycast",

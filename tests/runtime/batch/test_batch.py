@@ -90,13 +90,13 @@ def test_contacts_match_mujocos_functions(tmp_path, pad, item):
     assert expected
     assert min(np.linalg.norm(force) for _, force, _, _ in expected) > 0.01
     assert value(state, "contact_found")[0, 0] == len(expected)
-    shown = expected[:4]
+    in_slots = expected[:4]
     for i, name in enumerate(("contact_pos", "contact_force", "contact_torque", "contact_normal")):
         array = value(state, name)[0, 0]
-        order = [int(np.abs(value(state, "contact_pos")[0, 0] - row[0]).sum(axis=1).argmin()) for row in shown]
-        assert sorted(order) == list(range(len(shown)))
-        np.testing.assert_allclose(array[order], [row[i] for row in shown], atol=1e-9)
-        assert not array[len(shown) :].any()  # empty slots are zero
+        order = [int(np.abs(value(state, "contact_pos")[0, 0] - row[0]).sum(axis=1).argmin()) for row in in_slots]
+        assert sorted(order) == list(range(len(in_slots)))
+        np.testing.assert_allclose(array[order], [row[i] for row in in_slots], atol=1e-9)
+        assert not array[len(in_slots) :].any()  # empty slots are zero
     if len(expected) <= 4:
         np.testing.assert_allclose(value(state, "contact_netforce")[0, 0], sum(row[1] for row in expected), atol=1e-9)
     # The force pushes the link away from the object.

@@ -71,8 +71,8 @@ def test_a_module_wants_only_the_fields_that_its_sensors_read(tmp_path, feels, f
     inputs = compiled(tmp_path, feels=feels).inputs
     assert {name for name in inputs.fields if name.startswith("object_")} == fields
     assert inputs.heated == (tuple(feels) if fields else ())
-    plain = {"only": {"body": "a", "material": "steel", "temperature": 40}, "cold": {"body": "d"}}
-    assert compiled(tmp_path, objects=plain, feels=["only"]).inputs.heated == ()
+    equal_objects = {"only": {"body": "a", "material": "steel", "temperature": 40}, "cold": {"body": "d"}}
+    assert compiled(tmp_path, objects=equal_objects, feels=["only"]).inputs.heated == ()
 
 
 def test_readings_agree_with_the_reference(tmp_path):
@@ -96,12 +96,12 @@ def test_readings_agree_with_the_reference(tmp_path):
 def test_an_artefact_keeps_heated_objects(tmp_path):
     touch = compiled(tmp_path)
     tgdsl.save(touch, tmp_path / "a.safetensors")
-    again = tgdsl.load(tmp_path / "a.safetensors", kinds=[THERMOMETER], dtype=torch.float64)
-    assert again.inputs == touch.inputs
+    loaded = tgdsl.load(tmp_path / "a.safetensors", kinds=[THERMOMETER], dtype=torch.float64)
+    assert loaded.inputs == touch.inputs
     state = touch.example_state(6)
-    torch.testing.assert_close(again(state)["free"], touch(state)["free"], rtol=0, atol=0)
-    again.reset()
-    torch.testing.assert_close(tgdsl.simulate(again, 3).read()["warm"][:, 0, 0], torch.full((3,), 26.85, dtype=torch.float64))
+    torch.testing.assert_close(loaded(state)["free"], touch(state)["free"], rtol=0, atol=0)
+    loaded.reset()
+    torch.testing.assert_close(tgdsl.simulate(loaded, 3).read()["warm"][:, 0, 0], torch.full((3,), 26.85, dtype=torch.float64))
     with pytest.raises(ArtifactError, match="plan format"):
         type(touch.plan).from_json(touch.plan.to_json().replace(f'"format":{FORMAT}', '"format":12'), touch.plan.arrays)
 
@@ -163,10 +163,10 @@ def test_set_values_survive_steps_and_resets(tmp_path, kind):
 @BOTH
 def test_values_written_into_live_tensors_are_in_the_next_state(tmp_path, kind):
     sim = simulator(kind, compiled(tmp_path), 3)
-    place = sim.heat.names.index("warm")
-    sim.heat.temperature[:, place] = torch.tensor([20.0, 30.0, 40.0])
+    column = sim.heat.names.index("warm")
+    sim.heat.temperature[:, column] = torch.tensor([20.0, 30.0, 40.0])
     sim.heat.material[1, sim.heat.names.index("kind")] = 0
-    assert sim.state().object_temperature[:, place].tolist() == [20, 30, 40]
+    assert sim.state().object_temperature[:, column].tolist() == [20, 30, 40]
     assert sim.read()["kind"][:, 0, 1].tolist() == [401.0] * 3
 
 

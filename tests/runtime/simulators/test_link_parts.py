@@ -199,16 +199,16 @@ def test_parts_of_link_and_object_share_the_slots(tmp_path, which):
         assert state.contact_found == len(contacts) and 5 < len(contacts) < 16
         total, tolerance = sum(force for _, force, _ in contacts), 1e-9 if which == "mujoco" else 2e-3
         np.testing.assert_allclose(state.contact_netforce[0, 0], total, rtol=0, atol=tolerance)
-        shown = state.contact_pos[0, 0, : min(slots, len(contacts))].double()
-        apart = torch.cdist(shown, torch.tensor(np.stack([pos for pos, _, _ in contacts])))
-        assert apart.amin(dim=1).max() < 1e-6 and len(set(apart.argmin(dim=1).tolist())) == len(shown)
+        shown_pos = state.contact_pos[0, 0, : min(slots, len(contacts))].double()
+        distances = torch.cdist(shown_pos, torch.tensor(np.stack([pos for pos, _, _ in contacts])))
+        assert distances.amin(dim=1).max() < 1e-6 and len(set(distances.argmin(dim=1).tolist())) == len(shown_pos)
         if warned:
             with pytest.warns(UserWarning, match="contacts of finger – item are more than `slots: 5`"):
                 readings = touch(state)
         else:
             readings = touch(state)
-        whole = readings["s"][0].sum(dim=0) + readings["s/missed"][0, 0]
-        np.testing.assert_allclose(whole.norm(), np.linalg.norm(total), rtol=0, atol=tolerance)
+        taxel_force = readings["s"][0].sum(dim=0) + readings["s/missed"][0, 0]
+        np.testing.assert_allclose(taxel_force.norm(), np.linalg.norm(total), rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize("which", MODELS)

@@ -196,8 +196,8 @@ def test_warp_sets_the_chosen_environments_and_leaves_the_others(tmp_path, form)
     assert {"geom_xpos", "qfrc_actuator", "qacc_warmstart", "time", "cvel", "sensordata"} <= set(after)
     for name, array in after.items():
         np.testing.assert_array_equal(array[[0, 2, 4]], before[name][[0, 2, 4]], err_msg=name)
-    state, other = sim.state(), cpu.state()
-    rows = {name: (getattr(state, name)[ids], getattr(other, name)[ids]) for name in touch.inputs.fields}
+    state, expected_state = sim.state(), cpu.state()
+    rows = {name: (getattr(state, name)[ids], getattr(expected_state, name)[ids]) for name in touch.inputs.fields}
     assert_agree(*(tgdsl.SceneState(**{name: pair[i] for name, pair in rows.items()}) for i in range(2)), touch.inputs.fields)
     assert (sim.arrays["time"][ids] == 0).all() and (sim.arrays["qacc_warmstart"][ids] == 0).all()
     for _ in range(5):

@@ -65,30 +65,30 @@ def test_more_contacts_than_slots_carry_the_whole_load(tmp_path, which):
     sim, state = settled(touch, which)
     with pytest.warns(UserWarning, match=r"contacts of pad – item are more than `slots: 8`.*`slots: (\d+)` would do") as caught:
         readings = touch(state)
-    most = int(state.contact_found.max())
-    assert most > 24 and f"`slots: {most}` would do" in str(caught[0].message)
-    shown = float(state.contact_force[0, 0, :, 2].sum())
-    assert shown > -0.5 * LOAD
+    num_contacts = int(state.contact_found.max())
+    assert num_contacts > 24 and f"`slots: {num_contacts}` would do" in str(caught[0].message)
+    shown_force = float(state.contact_force[0, 0, :, 2].sum())
+    assert shown_force > -0.5 * LOAD
     net = state.contact_netforce[0, 0].to(readings["shared"].dtype)
     assert float(net[2]) == pytest.approx(-LOAD, rel=RESTING)
     torch.testing.assert_close(readings["shared"][0].sum(dim=0), net, rtol=1e-5, atol=1e-5 * LOAD)
     torch.testing.assert_close(readings["shared/missed"][0, 0], torch.zeros_like(net), rtol=0, atol=1e-5 * LOAD)
     depth = compiled(tmp_path, TEN, ITEM, {"plain": {"kind": "kinematic_taxel", "outputs": ["force"], "feels": ["item"]}})
-    plain = depth.to(touch.dtype)(state)["plain"]
-    factor = readings["balanced"].norm() / plain.norm()
-    torch.testing.assert_close(readings["balanced"], plain * factor, rtol=1e-4, atol=1e-6)
+    unbalanced = depth.to(touch.dtype)(state)["plain"]
+    factor = readings["balanced"].norm() / unbalanced.norm()
+    torch.testing.assert_close(readings["balanced"], unbalanced * factor, rtol=1e-4, atol=1e-6)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         touch(state)
         sim.step()
         touch(sim.state())
     enough = compiled(
-        tmp_path, TEN, ITEM, of_kinds(["item"]) | {"shared": {"kind": "force_taxel", "feels": ["item"], "slots": most}}
+        tmp_path, TEN, ITEM, of_kinds(["item"]) | {"shared": {"kind": "force_taxel", "feels": ["item"], "slots": num_contacts}}
     )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        whole = enough(settled(enough, which)[1])
-    torch.testing.assert_close(whole["balanced"].norm() / plain.norm(), factor, rtol=1e-3, atol=0)
+        enough_readings = enough(settled(enough, which)[1])
+    torch.testing.assert_close(enough_readings["balanced"].norm() / unbalanced.norm(), factor, rtol=1e-3, atol=0)
 
 
 def pad_state(touch, pos, force, net, found=True):
@@ -96,16 +96,16 @@ def pad_state(touch, pos, force, net, found=True):
     fields = {
         name: torch.zeros(1, 1, touch.inputs.slots, 3, dtype=torch.float64) for name in ("pos", "force", "torque", "normal")
     }
-    for slot, (place, push) in enumerate(zip(pos, force, strict=True)):
-        fields["pos"][0, 0, slot], fields["force"][0, 0, slot] = torch.tensor(place), torch.tensor(push)
+    for slot, (contact_pos, contact_force) in enumerate(zip(pos, force, strict=True)):
+        fields["pos"][0, 0, slot], fields["force"][0, 0, slot] = torch.tensor(contact_pos), torch.tensor(contact_force)
         fields["normal"][0, 0, slot, 2] = -1
     rows = [[0.0, 0, 0.029] if body == "item" else [0.0, 0, 0] for body in touch.inputs.bodies]
-    num = len(rows)
+    num_bodies = len(rows)
     return tgdsl.SceneState(
         body_pos=torch.tensor([rows], dtype=torch.float64),
-        body_quat=torch.tensor([[[1.0, 0, 0, 0]] * num], dtype=torch.float64),
-        body_linvel=torch.zeros(1, num, 3, dtype=torch.float64),
-        body_angvel=torch.zeros(1, num, 3, dtype=torch.float64),
+        body_quat=torch.tensor([[[1.0, 0, 0, 0]] * num_bodies], dtype=torch.float64),
+        body_linvel=torch.zeros(1, num_bodies, 3, dtype=torch.float64),
+        body_angvel=torch.zeros(1, num_bodies, 3, dtype=torch.float64),
         contact_found=torch.tensor([[found]]),
         contact_netforce=torch.tensor([[net]], dtype=torch.float64),
         **{f"contact_{name}": value for name, value in fields.items()},
@@ -125,12 +125,12 @@ def test_force_without_slots_acts_at_the_centre_of_the_shown_contacts(tmp_path, 
     taxels = readings["shared"][0].double()
     np.testing.assert_allclose(taxels.sum(dim=0), net, atol=1e-5 * 10)
     assert readings["shared/missed"].abs().max() < 1e-5 * 10
-    places = np.array(touch.taxels["shared"]["pos"].tolist())
+    positions = np.array(touch.taxels["shared"]["pos"].tolist())
     weight = np.linalg.norm(force, axis=1)
     centre = weight @ np.array(pos) / weight.sum()
-    lacking = np.array(net) - np.sum(force, axis=0)
-    expected = np.cross(pos, force).sum(axis=0) + np.cross(centre, lacking)
-    moment = np.cross(places, taxels.detach().numpy()).sum(axis=0) + readings["shared/residual"][0, 0].double().numpy()
+    missing = np.array(net) - np.sum(force, axis=0)
+    expected = np.cross(pos, force).sum(axis=0) + np.cross(centre, missing)
+    moment = np.cross(positions, taxels.detach().numpy()).sum(axis=0) + readings["shared/residual"][0, 0].double().numpy()
     np.testing.assert_allclose(moment, expected, atol=1e-6)
 
 
@@ -141,8 +141,8 @@ def test_contacts_without_force_share_the_net_force_equally(tmp_path):
     pos = [[-0.015, 0.015, 0.01], [0.015, 0.015, 0.01]]
     taxels = touch(pad_state(touch, pos, np.zeros((2, 3)).tolist(), [0.0, 0, -2]))["shared"][0]
     np.testing.assert_allclose(taxels.sum(dim=0), [0, 0, -2], atol=1e-12)
-    left = torch.tensor(touch.taxels["shared"]["pos"][:, 0] < 0)
-    assert float(taxels[left, 2].sum()) == pytest.approx(-1, rel=1e-9)
+    is_left = torch.tensor(touch.taxels["shared"]["pos"][:, 0] < 0)
+    assert float(taxels[is_left, 2].sum()) == pytest.approx(-1, rel=1e-9)
     readings = touch(pad_state(touch, [], [], [0.0, 0, -2]))
     assert not readings["shared"].any()
     np.testing.assert_array_equal(readings["shared/missed"][0, 0], [0, 0, -2])
@@ -152,12 +152,12 @@ def test_contacts_without_force_share_the_net_force_equally(tmp_path):
 def test_states_of_users_are_checked_for_missing_slots(tmp_path, found, advice):
     """A user's state with too little force in its slots is warned of; if it counts more contacts, the warning has the number."""
     touch = compiled(tmp_path, ONE, ITEM, {"shared": {"kind": "force_taxel", "feels": ["item"], "slots": 1}})
-    whole = [0.0, 0, -1.0001] if found == 11.0 else [0.0, 0, -2]
+    netforce = [0.0, 0, -1.0001] if found == 11.0 else [0.0, 0, -2]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         touch(pad_state(touch, [[0.0, 0, 0.01]], [[0.0, 0, -1]], [0.0, 0, -1.0001], min(found, 1.0)))
     with pytest.warns(UserWarning, match=f"pad – item are more than `slots: 1`.*`{advice}` would do"):
-        touch(pad_state(touch, [[0.0, 0, 0.01]], [[0.0, 0, -1]], whole, found))
+        touch(pad_state(touch, [[0.0, 0, 0.01]], [[0.0, 0, -1]], netforce, found))
 
 
 def test_zero_environments_give_empty_readings_without_a_warning(tmp_path):
@@ -265,7 +265,7 @@ def test_the_position_of_an_unused_slot_is_ignored(three):
     before = touch(state)["shared"].clone()
     is_used = state.contact_normal.any(dim=-1, keepdim=True)
     assert not is_used.all()
-    for place in (1e9, torch.nan):
+    for position in (1e9, torch.nan):
         touch.reset()
-        after = touch(dataclasses.replace(state, contact_pos=torch.where(is_used, state.contact_pos, place)))
+        after = touch(dataclasses.replace(state, contact_pos=torch.where(is_used, state.contact_pos, position)))
         torch.testing.assert_close(after["shared"], before, rtol=0, atol=0)

@@ -74,24 +74,24 @@ def test_reading_some_environments_matches_the_module_on_the_whole_state(tmp_pat
         mask = torch.zeros(4, dtype=torch.bool)
         mask[which] = True
         sim.reset(mask, contacts=contacts, qpos=DEEP)
-        other = copy.deepcopy(touch)
-        expected = other(sim.state(), mask)
+        copied = copy.deepcopy(touch)
+        expected = copied(sim.state(), mask)
         readings = sim.read(mask)
-        again = sim.read(which)  # by indices, and a second time
+        by_index = sim.read(which)  # by indices, and a second time
     for name, reading in expected.items():
-        assert torch.equal(readings[name], reading) and torch.equal(again[name], reading), name
+        assert torch.equal(readings[name], reading) and torch.equal(by_index[name], reading), name
     assert any(reading[mask].any() for reading in readings.values()) == (stored != "none")
 
 
 @BOTH
 def test_the_next_step_does_not_depend_on_evaluated_contacts(tmp_path, simulator):
-    ends = []
+    results = []
     for contacts in ("none", "evaluate"):
         _, sim = stepped_simulation(simulator, tmp_path)
         sim.reset([2], contacts=contacts, qpos=DEEP)
         sim.step(np.array([0.1, 0.1]))
-        ends.append((sim.qpos.clone(), sim.qvel.clone(), tensors(sim.state())))
-    (qpos, qvel, state), (qpos_evaluated, qvel_evaluated, state_evaluated) = ends
+        results.append((sim.qpos.clone(), sim.qvel.clone(), tensors(sim.state())))
+    (qpos, qvel, state), (qpos_evaluated, qvel_evaluated, state_evaluated) = results
     assert torch.equal(qpos, qpos_evaluated) and torch.equal(qvel, qvel_evaluated)
     assert state["contact_found"][2].any()
     for name, value in state.items():

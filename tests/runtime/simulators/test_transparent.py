@@ -29,14 +29,14 @@ def cube(folder, looks: str) -> tgdsl.TactileModule:
 @pytest.mark.slow
 @pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
 def test_transparent_objects_rest_like_visible_ones(tmp_path, simulator):
-    ends = []
+    final_qpos = []
     for looks in LOOKS:
         sim = simulator(cube(tmp_path, looks), 3)
         for _ in range(60):
             sim.step()
-        ends.append(sim.qpos.numpy().copy())
-    np.testing.assert_allclose(ends[0][:, 2], HEIGHT, atol=1e-3)
-    np.testing.assert_array_equal(ends[0], ends[1])
+        final_qpos.append(sim.qpos.numpy().copy())
+    np.testing.assert_allclose(final_qpos[0][:, 2], HEIGHT, atol=1e-3)
+    np.testing.assert_array_equal(final_qpos[0], final_qpos[1])
 
 
 @pytest.mark.parametrize("looks", list(LOOKS))

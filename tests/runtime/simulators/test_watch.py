@@ -70,15 +70,15 @@ def test_watched_values_match_mujoco_at_the_instant_of_readings(tmp_path, simula
 @BOTH
 @pytest.mark.parametrize("substeps", [1, 4])
 def test_watching_does_not_change_the_simulation(tmp_path, simulator, substeps):
-    ends = []
+    final_states = []
     for watch in (None, WATCH):
         sim = watching(simulator, tmp_path, watch, substeps=substeps)
         for _ in range(5):
             sim.step(np.array([0.1, -0.2]))
             if watch:
                 sim.watched()
-        ends.append((sim.qpos.clone(), sim.state().body_pos.clone()))
-    for expected, result in zip(*ends, strict=True):
+        final_states.append((sim.qpos.clone(), sim.state().body_pos.clone()))
+    for expected, result in zip(*final_states, strict=True):
         assert torch.equal(expected, result)
 
 
@@ -128,9 +128,9 @@ def test_quaternions_rotate_and_multiply_like_mujocos():
     rng = np.random.default_rng(0)
     one, two = (q / np.linalg.norm(q, axis=1, keepdims=True) for q in rng.normal(size=(2, 20, 4)))
     vectors = rng.normal(size=(20, 3))
-    turned, multiplied = np.zeros((20, 3)), np.zeros((20, 4))
+    rotated_vectors, multiplied = np.zeros((20, 3)), np.zeros((20, 4))
     for i in range(20):
-        mujoco.mju_rotVecQuat(turned[i], vectors[i], one[i])
+        mujoco.mju_rotVecQuat(rotated_vectors[i], vectors[i], one[i])
         mujoco.mju_mulQuat(multiplied[i], one[i], two[i])
-    np.testing.assert_allclose(rotated(torch.from_numpy(one), torch.from_numpy(vectors)), turned, atol=1e-15)
+    np.testing.assert_allclose(rotated(torch.from_numpy(one), torch.from_numpy(vectors)), rotated_vectors, atol=1e-15)
     np.testing.assert_allclose(product(torch.from_numpy(one), torch.from_numpy(two)), multiplied, atol=1e-15)

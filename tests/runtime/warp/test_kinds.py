@@ -101,7 +101,7 @@ def test_a_cube_at_rest_reads_the_same_after_two_hundred_steps(plan):
                 step_readings = touch(state)
                 heights[-1].append(state.body_pos[:, touch.inputs.bodies.index("cube"), 2].double())
                 means.append({name: value.double().abs().mean() for name, value in step_readings.items()})
-        readings.append({name: torch.stack([one[name] for one in means]).mean() for name in means[0]})
+        readings.append({name: torch.stack([step[name] for step in means]).mean() for name in means[0]})
         total = step_readings["force"][..., :3].double().sum(dim=1)
         expected = torch.tensor([0, 0, -WEIGHT], dtype=torch.float64).expand(2, 3)
         torch.testing.assert_close(total, expected, atol=1e-3, rtol=0)

@@ -137,5 +137,5 @@ def test_environments_may_have_different_frictions(tmp_path):
     sim.step()
     sim.arrays["qvel"][:, 0] = 0.3
     sim.step()
-    lost = 0.3 - sim.arrays["qvel"][:, 0]
-    torch.testing.assert_close(lost, friction * 9.81 * 50 * 0.002, rtol=0.02, atol=0)
+    lost_speed = 0.3 - sim.arrays["qvel"][:, 0]
+    torch.testing.assert_close(lost_speed, friction * 9.81 * 50 * 0.002, rtol=0.02, atol=0)

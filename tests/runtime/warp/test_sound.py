@@ -32,7 +32,7 @@ def test_motors_and_microphones_agree_in_both_simulators(tmp_path):
         for _ in range(30):
             sim.step(control)
             blocks.append(touch(sim.state()))
-        readings.append({name: torch.cat([own[name] for own in blocks], dim=1) for name in ("motors", "ear", "room")})
+        readings.append({name: torch.cat([step[name] for step in blocks], dim=1) for name in ("motors", "ear", "room")})
     for name, expected in readings[1].items():
         assert expected.shape[1] == 30 * 60 and expected.abs().max() > 1e-4
         error = (readings[0][name] - expected).abs().amax() / expected.abs().amax()

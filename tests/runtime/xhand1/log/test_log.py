@@ -152,21 +152,25 @@ def small_log(tmp_path) -> bytes:
 
 
 def test_a_truncated_log_is_refused(tmp_path):
-    whole = small_log(tmp_path)
-    for end in [0, 1, 10, *range(100, len(whole), 997), len(whole) - 1]:
-        (tmp_path / "cut.npz").write_bytes(whole[:end])
+    content = small_log(tmp_path)
+    for end in [0, 1, 10, *range(100, len(content), 997), len(content) - 1]:
+        (tmp_path / "cut.npz").write_bytes(content[:end])
         with pytest.raises(LogError, match=r"cut\.npz: this log is damaged, cut, or no \.npz file: "):
             open_log(tmp_path / "cut.npz")
 
 
 def test_a_changed_byte_is_detected_or_harmless(tmp_path):
-    whole, expected, rng = bytearray(small_log(tmp_path)), random_readings(np.array([1.0, 1.1, 1.2])), np.random.default_rng(3)
+    content, expected, rng = (
+        bytearray(small_log(tmp_path)),
+        random_readings(np.array([1.0, 1.1, 1.2])),
+        np.random.default_rng(3),
+    )
     num_refused = 0
-    for place in rng.choice(len(whole), 400, replace=False):
-        byte = whole[place]
-        whole[place] ^= int(rng.integers(1, 256))
-        (tmp_path / "changed.npz").write_bytes(whole)
-        whole[place] = byte
+    for index in rng.choice(len(content), 400, replace=False):
+        byte = content[index]
+        content[index] ^= int(rng.integers(1, 256))
+        (tmp_path / "changed.npz").write_bytes(content)
+        content[index] = byte
         try:
             readings = list(open_log(tmp_path / "changed.npz").readings())
         except LogError:
