@@ -34,7 +34,8 @@ def test_all_kinds_in_one_graph(tmp_path):
         return compile_fx(graph, inputs, config_patches=options)
 
     compiled.compile(backend=code_of)
-    assert_same_readings(compiled, touch, range(4), 7)
+    # 13 is no other size of the module: torch.compile takes equal sizes for one, and compiles again when they differ.
+    assert_same_readings(compiled, touch, range(4), 13)
     read(more, range(2), 11)
     compiled.load_state_dict(more.state_dict())
     assert_same_readings(compiled, more, range(2, 5), 11)
