@@ -58,10 +58,10 @@ def entities() -> dict[str, EntityCfg]:
 
 def make(sensor, terms, rewards=None) -> ManagerBasedRlEnv:
     groups = {"actor": ObservationGroupCfg(terms={name: ObservationTermCfg(**term) for name, term in terms.items()})}
-    return made(SceneCfg(num_envs=2, entities=entities(), sensors=(sensor,)), groups, rewards)
+    return make_env(SceneCfg(num_envs=2, entities=entities(), sensors=(sensor,)), groups, rewards)
 
 
-def made(scene, observations, rewards=None) -> ManagerBasedRlEnv:
+def make_env(scene, observations, rewards=None) -> ManagerBasedRlEnv:
     cfg = ManagerBasedRlEnvCfg(
         decimation=DECIMATION,
         episode_length_s=10.0,
@@ -202,7 +202,7 @@ def test_the_documented_code_adds_touch_to_an_environment(tmp_path, monkeypatch)
     (tmp_path / "hand.yaml").write_text(json.dumps(document(tmp_path, tips=tips)), encoding="utf-8")
     names = {"entities": entities()}
     exec(lines, names)
-    env = made(names["scene"], names["observations"])
+    env = make_env(names["scene"], names["observations"])
     env.reset()
     assert steps(env, 1).shape == (2, 8 * 3 + 4)  # forces of eight taxels, and depths of the pad's four
     env.close()

@@ -80,11 +80,11 @@ def test_instrument_adds_just_the_needed_sensors_once(case):
 def test_the_kept_scene_has_the_same_sensors(tmp_path, case):
     needed, expected = CASES[case]
     (tmp_path / "scene.xml").write_text(TWO)
-    kept = scene_model(scene_file(load_model(tmp_path / "scene.xml"), needed))
-    assert sensors_of(kept) == expected
+    kept_scene = scene_model(scene_file(load_model(tmp_path / "scene.xml"), needed))
+    assert sensors_of(kept_scene) == expected
     by_hand = instrument(mujoco.MjSpec.from_string(TWO), needed).compile()
     for name in ("sensor_type", "sensor_objid", "sensor_refid", "sensor_intprm", "sensor_dim", "sensor_adr"):
-        np.testing.assert_array_equal(getattr(kept, name), getattr(by_hand, name), err_msg=name)
+        np.testing.assert_array_equal(getattr(kept_scene, name), getattr(by_hand, name), err_msg=name)
 
 
 def test_forces_act_on_the_link_and_normals_point_out_of_the_object():
@@ -266,14 +266,14 @@ def same(found: mujoco.MjModel, expected: mujoco.MjModel) -> None:
 def test_kept_scenes_load_from_any_folder(tmp_path, monkeypatch, make):
     main = SCENES[make](tmp_path / "project")
     model = load_model(main)
-    kept = scene_file(model, NOTHING)
+    kept_scene = scene_file(model, NOTHING)
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)
-    same(scene_model(kept), model.compiled)
+    same(scene_model(kept_scene), model.compiled)
     for path in (tmp_path / "project").rglob("*.xml"):
         path.unlink()
-    same(scene_model(kept), model.compiled)  # the text is in the artefact; only assets are read again
+    same(scene_model(kept_scene), model.compiled)  # the text is in the artefact; only assets are read again
 
 
 @pytest.mark.parametrize("make", SCENES)
@@ -287,26 +287,26 @@ def test_scenes_do_not_depend_on_where_they_are_compiled(tmp_path, monkeypatch, 
 
 def test_kept_scenes_contain_no_folder(tmp_path):
     """In another folder, the scene has the same text and parts; only paths of assets differ."""
-    kept = [scene_file(load_model(attached(tmp_path / name)), NOTHING) for name in ("one", "two")]
-    assert kept[0].mjcf == kept[1].mjcf
-    assert kept[0].parts == kept[1].parts
-    assert [asset.key for asset in kept[0].assets] == [asset.key for asset in kept[1].assets]
-    assert [asset.sha256 for asset in kept[0].assets] == [asset.sha256 for asset in kept[1].assets]
-    assert str(tmp_path) not in kept[0].mjcf + "".join(kept[0].parts.values())
+    kept_scenes = [scene_file(load_model(attached(tmp_path / name)), NOTHING) for name in ("one", "two")]
+    assert kept_scenes[0].mjcf == kept_scenes[1].mjcf
+    assert kept_scenes[0].parts == kept_scenes[1].parts
+    assert [asset.key for asset in kept_scenes[0].assets] == [asset.key for asset in kept_scenes[1].assets]
+    assert [asset.sha256 for asset in kept_scenes[0].assets] == [asset.sha256 for asset in kept_scenes[1].assets]
+    assert str(tmp_path) not in kept_scenes[0].mjcf + "".join(kept_scenes[0].parts.values())
 
 
 def test_changed_or_missing_assets_are_refused(tmp_path):
     main = one_name_in_two_folders(tmp_path)
-    kept = scene_file(load_model(main), NOTHING)
+    kept_scene = scene_file(load_model(main), NOTHING)
     brick(tmp_path / "right" / "tip.stl", 0.05, 0.06, 0.08)
     with pytest.raises(ArtifactError) as caught:
-        scene_model(kept)
+        scene_model(kept_scene)
     assert (
         str(caught.value) == f"asset {tmp_path.resolve()}/right/tip.stl has changed since the scene was compiled; compile again"
     )
     (tmp_path / "right" / "tip.stl").unlink()
     with pytest.raises(ArtifactError) as caught:
-        scene_model(kept)
+        scene_model(kept_scene)
     assert str(caught.value) == (
         f"asset {tmp_path.resolve()}/right/tip.stl of the scene cannot be read: No such file or directory; compile again"
     )
@@ -352,13 +352,13 @@ def test_urdf_scenes(tmp_path, monkeypatch):
     joint = "<joint name='j' type='fixed'><parent link='pad'/><child link='tip'/></joint>"
     (tmp_path / "hand" / "hand.urdf").write_text(f"<robot name='r'>{links}{joint}</robot>")
     model = load_model(tmp_path / "hand" / "hand.urdf")
-    kept = scene_file(model, NOTHING)
+    kept_scene = scene_file(model, NOTHING)
     monkeypatch.chdir("/")
-    loaded = scene_model(kept)
+    loaded = scene_model(kept_scene)
     assert loaded.nmesh == 2
     for name in ("mesh_vert", "geom_pos", "geom_size"):
         np.testing.assert_allclose(getattr(loaded, name), getattr(model.compiled, name), atol=1e-6)
-    assert str(tmp_path) not in kept.mjcf
+    assert str(tmp_path) not in kept_scene.mjcf
 
 
 def test_the_palm_scene_is_found_by_name_in_another_checkout(tmp_path, monkeypatch):

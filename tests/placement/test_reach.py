@@ -146,7 +146,7 @@ def test_links_fixed_to_the_world_cover_each_other(tmp_path):
     taxels = layout({"base": [[0, 0, 0.01]], "jaw": [[0, 0, -0.01], [0, 0, 0.01], [0, 0.01, 0]]})
     colliders = Colliders(robot)
     records = unfelt(colliders, taxels, reach(colliders, taxels))
-    assert [str(own) for own in records] == [
+    assert [str(record) for record in records] == [
         'base: 1 of 1 taxels inside "jaw" in the initial state',
         'jaw: 1 of 3 taxels inside "base" in the initial state',
         "jaw: 1 of 3 taxels inside unnamed body 5 in the initial state",

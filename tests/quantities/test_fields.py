@@ -87,7 +87,7 @@ def test_a_meshed_cube_has_the_moments_of_a_cube():
     ],
     ids=["overlapping", "touching", "the same twice", "one within the other"],
 )
-def test_moments_of_boxes_are_those_of_their_union(parts):
+def test_moments_of_boxes_match_their_union(parts):
     geoms, whole = [geom_of("box", size, at) for size, at in parts], [geom_of("box", [0.02, 0.01, 0.01])]
     assert surface_area(geoms) == pytest.approx(surface_area(whole), rel=1e-3)
     pos = places(200)

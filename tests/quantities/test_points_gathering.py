@@ -31,6 +31,6 @@ def test_planes_of_a_rotation_and_of_an_offset_have_the_same_strides(tmp_path, g
     state = touch.example_state(5)
     tensors = {name: getattr(state, name) for name in touch.inputs.fields if name != "dt"}
     scene = scene_of(touch.plan, touch.constants.tree, tensors, {}, {}, torch.float32)
-    ((points_of_object,),) = [found.values() for found in POINTS.gather(touch.constants.tree["quantities"]["points"], scene)]
+    ((points_of_object,),) = [item.values() for item in POINTS.gather(touch.constants.tree["quantities"]["points"], scene)]
     strides = [{part.stride() for part in parts} for parts in (points_of_object.pairs.rotation, points_of_object.pairs.offset)]
-    assert [len(found) for found in strides] == [1, 1] and (points_of_object.pairs.gate is not None) == (gate == "contact_pair")
+    assert [len(item) for item in strides] == [1, 1] and (points_of_object.pairs.gate is not None) == (gate == "contact_pair")

@@ -96,10 +96,10 @@ def scene():
 def test_motion_is_that_of_the_deepest_object(scene, kernel, is_known):
     pairs, probes, boxes, pair, reach = scene
     wants, felt = ("motion", "normal"), [boxes[i] for i in WHICH]
-    known = {"pair": pair} | (
+    kernel_inputs = {"pair": pair} | (
         dict(zip(("spheres", "geoms"), geom_tables([target.geoms for target in felt]), strict=True)) if is_known else {}
     )
-    result = search(pairs, probes, felt, known, reach, wants)
+    result = search(pairs, probes, felt, kernel_inputs, reach, wants)
     near = measure(pairs, probes, boxes)
     expected = penetration(pairs, probes, [near[i] for i in WHICH], reach, wants)
     assert 0.2 < (expected.depth > 0).double().mean() < 0.9
@@ -152,7 +152,7 @@ def test_a_cpu_has_no_kernel(scene):
     assert search(pairs, probes, [boxes[i] for i in WHICH], {"pair": pair}, reach, ("normal",)) is None
 
 
-def test_unsupported_searches_are_left_to_torch():
+def test_searches_without_a_kernel_are_left_to_torch():
     many = ["box"] * contact_depth.THRESHOLD
     assert is_searchable(many, {"normal", "motion"}) and is_searchable(many, ())
     assert not is_searchable(many, {"normal", "distance"})

@@ -1,4 +1,4 @@
-"""All mistakes of a document are found at once, located, and come with a hint."""
+"""All mistakes of a document are reported at once, located and with hints."""
 
 import pytest
 from documents import DOCUMENT, LAYOUT, POISSON, mistakes, read, write
@@ -103,11 +103,11 @@ def test_many_mistakes_are_sorted_and_cause_no_others(tmp_path):
 
 @pytest.mark.parametrize("found", ["3", "[{body: ball}]", "", "ball"])
 def test_a_part_of_a_wrong_type_causes_no_unknown_names(tmp_path, found):
-    shown = {"3": "3", "": "nothing", "ball": '"ball"'}.get(found, "a list of 1")
+    expected = {"3": "3", "": "nothing", "ball": '"ball"'}.get(found, "a list of 1")
     document = DOCUMENT.replace("objects:\n  ball: {body: ball}\n  cube: {body: cube}\n", f"objects: {found}\n")
     document += f"    noise: mine\nnoise: {found}\nobservations: {found}\n"
     messages = [text.split(": ", 1)[1] for text in mistakes(tmp_path, document)]
-    assert messages == [f"{key}: found {shown}, expected a mapping" for key in ("objects", "noise", "observations")]
+    assert messages == [f"{key}: found {expected}, expected a mapping" for key in ("objects", "noise", "observations")]
 
 
 def test_a_broken_profile_does_not_fall_back_to_a_built_in_one(tmp_path):

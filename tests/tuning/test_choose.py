@@ -1,4 +1,4 @@
-"""What `accuracy` chooses: checked on other states, for sensors that share an object, and beside values that are written."""
+"""Choices of `accuracy`: checked on other states, for sensors that share an object, and with values that are written."""
 
 import dataclasses
 import warnings

@@ -84,8 +84,8 @@ def test_joints_unknown_to_mujoco_are_refused(tmp_path):
     assert error_of(stage) == "/far: PhysicsDistanceJoint is not supported: MuJoCo has no such joint"
     stage.RemovePrim("/far")
     stage.DefinePrim("/gear", "PhysxPhysicsGearJoint")
-    known = "known joints: revolute, prismatic, spherical, fixed, generic"
-    assert error_of(stage) == f"/gear: PhysxPhysicsGearJoint is not supported; {known}"
+    hint = "known joints: revolute, prismatic, spherical, fixed, generic"
+    assert error_of(stage) == f"/gear: PhysxPhysicsGearJoint is not supported; {hint}"
     stage.RemovePrim("/gear")
     add_joint(stage, "/loop", "slide", ("/b0", "/b1"), (1, 0, 0), excludeFromArticulation=True)
     assert error_of(stage) == "/loop: a prismatic joint closes a loop, for which MuJoCo has no constraint"

@@ -60,10 +60,10 @@ def test_masses_match_usd_core(tmp_path, body, collider, material, expected):
         add_material(stage, "/m", prim, density=float(material))
 
     def box(at: Usd.Prim):
-        found = UsdPhysics.RigidBodyAPI.MassInformation()
-        found.volume, found.inertia = 8.0, Gf.Matrix3f(16 / 3)
-        found.localPos, found.localRot = Gf.Vec3f(*boxes[str(at.GetPath())]), Gf.Quatf(1)
-        return found
+        information = UsdPhysics.RigidBodyAPI.MassInformation()
+        information.volume, information.inertia = 8.0, Gf.Matrix3f(16 / 3)
+        information.localPos, information.localRot = Gf.Vec3f(*boxes[str(at.GetPath())]), Gf.Quatf(1)
+        return information
 
     mass, moments, centre, axes = UsdPhysics.RigidBodyAPI(prim).ComputeMassProperties(box)
     rotation = Rotation.from_quat([axes.GetReal(), *axes.GetImaginary()], scalar_first=True).as_matrix()

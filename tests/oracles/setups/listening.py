@@ -43,9 +43,9 @@ class ToneSpec(LinkSpec):
     kind: Literal["tone"]
     """A tone [Pa]."""
     frequency: Frequency = 100.0
-    """Of the first link [Hz]; that of others is 1.3, 1.6, … times as high."""
+    """Frequency of the first link [Hz]; others are 1.3, 1.6, … times as high."""
     pulse: StrictInt = -1
-    """In place of a tone: a pulse at this sample of the episode's second step."""
+    """Instead of a tone: a pulse at this sample of the episode's second step."""
     samples: Annotated[StrictInt, Field(ge=1)] = 16
     """Per step."""
     substeps: Annotated[StrictInt, Field(ge=1)] = 1

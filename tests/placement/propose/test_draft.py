@@ -48,8 +48,8 @@ def test_the_density_of_some_links_can_change(tmp_path):
         "high",
     }
     for tip in TIPS:
-        shown = draft.samples(next(link for link in draft.proposal.links if link.name == tip), "med")
-        assert np.array_equal(shown.pos, taxels[tip]["pos"]) and np.array_equal(shown.normal, taxels[tip]["normal"])
+        samples = draft.samples(next(link for link in draft.proposal.links if link.name == tip), "med")
+        assert np.array_equal(samples.pos, taxels[tip]["pos"]) and np.array_equal(samples.normal, taxels[tip]["normal"])
 
 
 def test_one_density_for_all_links_gives_the_file_of_the_command(tmp_path, here):

@@ -55,7 +55,7 @@ def test_every_taxel_can_feel(tmp_path, here, side):
 
 
 @SIDES
-def test_areas_are_those_of_the_sampled_surface(tmp_path, side):
+def test_areas_count_only_the_sampled_surface(tmp_path, side):
     """The first 8 mm of the finger's box of 40 × 6 × 6 mm are inside the palm: one end and 32 mm of four sides remain."""
     (tmp_path / "hand.xml").write_text(hand(side))
     links = {link.name: link for link in propose(load_model(tmp_path / "hand.xml"), 1e6, with_groups=False).links}

@@ -32,7 +32,7 @@ def lever_finger(name: str, x: float, turn: int) -> str:
           <geom type="box" size=".003 .006 .018" pos="0 0 -.02"/></body></body></body>"""
 
 
-def test_a_tip_above_the_rest_of_its_finger_in_the_tree_is_the_tip(tmp_path):
+def test_a_tip_may_be_the_parent_of_its_finger_in_the_tree(tmp_path):
     """Levers and inner links of 4 cm, 12 mm apart, form parallelograms: all links move inward equally."""
     fingers = lever_finger("left", 0.04, 180) + lever_finger("right", -0.04, 0)
     loops = "".join(f'<connect body1="{side}_inner" body2="base" anchor="0 0 -.04"/>' for side in ("left", "right"))

@@ -167,15 +167,15 @@ def test_count_keeps_the_central_cells_and_breaks_ties_by_row_and_column(noise):
     mesh = box((0.04, 0.04, 0.01))
     vertices = mesh.vertices + np.random.default_rng(1).normal(size=(8, 3)) * noise
     mesh = trimesh.Trimesh(vertices, mesh.faces, process=False)
-    kept = {
+    cells_by_count = {
         count: sample(surface_of(mesh), placement("grid", rows=4, columns=4, direction=DOWN, count=count), HERE).cell
         for count in (1, 4, 5, 12)
     }
-    np.testing.assert_array_equal(kept[1], [(1, 1)])
-    np.testing.assert_array_equal(kept[4], [(1, 1), (1, 2), (2, 1), (2, 2)])
-    np.testing.assert_array_equal(kept[5], [(0, 1), (1, 1), (1, 2), (2, 1), (2, 2)])
+    np.testing.assert_array_equal(cells_by_count[1], [(1, 1)])
+    np.testing.assert_array_equal(cells_by_count[4], [(1, 1), (1, 2), (2, 1), (2, 2)])
+    np.testing.assert_array_equal(cells_by_count[5], [(0, 1), (1, 1), (1, 2), (2, 1), (2, 2)])
     corners = {(0, 0), (0, 3), (3, 0), (3, 3)}
-    assert {tuple(cell) for cell in kept[12].tolist()} == {(r, c) for r in range(4) for c in range(4)} - corners
+    assert {tuple(cell) for cell in cells_by_count[12].tolist()} == {(r, c) for r in range(4) for c in range(4)} - corners
 
 
 def test_count_measures_in_metres():
