@@ -224,7 +224,7 @@ def visible_rectangle(view: OrthographicView, region: Region) -> tuple[Float[np.
 def _raster_bounds(
     view: OrthographicView, region: Region, low: Float[np.ndarray, " 2"], high: Float[np.ndarray, " 2"]
 ) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]:
-    """Return the bounds of the rays of a fine raster over a rectangle whose first hit is in the region; (inf, −inf) without any.
+    """Return the bounds of the rays of a fine raster whose first hit is in the region; (inf, −inf) if there is none.
 
     Lines of the raster are followed from each side until one has such a hit.
     """
