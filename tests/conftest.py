@@ -60,12 +60,12 @@ def no_onnx(monkeypatch):
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the suite that kinds inherit, which has no marks: other people's pytest would not know them.
 
-    A third of its environments suffice here, where each kind has other tests too. The longest test begins first, so that no
+    Seven environments suffice here, where each kind has other tests too. The longest test begins first, so that no
     process waits for it at the end.
     """
     items.sort(key=lambda item: item.name != "test_all_kinds_in_one_graph")
     if suite := sys.modules.get("tgdsl.testing.conformance"):
-        suite.KindConformance.num_envs = 4
+        suite.KindConformance.num_envs = 7
     for item in items:
         if getattr(item, "originalname", "") == "test_compiled_equals_eager":
             item.add_marker("slow")
