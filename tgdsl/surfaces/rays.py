@@ -241,6 +241,8 @@ def _raster_bounds(
             if len(hits):
                 bound[axis] = outermost(hits[:, axis])
                 break
+        else:
+            break
     return low, high
 
 
