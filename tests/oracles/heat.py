@@ -1,6 +1,7 @@
 """Heat: conduction within a link and between touching bodies, against Carslaw and Jaeger, *Conduction of Heat in Solids*."""
 
 from functools import cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,7 @@ def decayed(count: Any, sides: Any, numbers: Any, dt: float, steps: int = 1, dty
     "A slab's mode {numbers} in cells, Δt = {dt:g} s", "exp(−α Σ (2n/L sin πm/2n)² t)",
     "separation of variables of the cells' equations", "what is left [1]", at=["after 3 steps"], atol=1e-6, defects=(13,),
     each=[((3, 1, 2), 1e-4), ((3, 1, 2), 0.02), ((3, 1, 2), 3.0), ((4, 3, 5), 0.02, torch.float32)],
-    also=[((1, 0, 0), 0.02, torch.float32), ((0, 2, 0), 3.0, torch.float32), ((0, 0, 0), 1e-4, torch.float64)],
+    also=product(((1, 0, 0), (0, 2, 0), (3, 1, 2), (4, 3, 5), (0, 0, 0)), (1e-4, 0.02, 3.0), (torch.float64, torch.float32)),
 )  # fmt: skip
 def modes_of_cells(numbers: Any, dt: float, dtype: torch.dtype = torch.float64):
     cells, solid = (rate(numbers, COUNT, SIDES, continuous=is_solid) for is_solid in (False, True))
@@ -112,7 +113,7 @@ def risen(seconds: float, flux: float, depth: float, n: int, dt: float = 0.05) -
 
 @oracle(
     "A thick solid under a constant flux, after {seconds:g} s", "ΔT = 2q/k (√(αt/π) e^(−x²/4αt) − x/2 erfc(x/√4αt))",
-    "Carslaw and Jaeger 2.9", "rise of temperature [K]", "depth [m]", each=[10.0], also=[1.0],
+    "Carslaw and Jaeger 2.9", "rise of temperature [K]", "depth [m]", each=[10.0], also=[1.0, 4.0],
 )  # fmt: skip
 def thick_solid(seconds: float, flux: float = 5000.0, depth: float = 0.2, n: int = 200, dt: float = 0.05):
     x, diffusion = (np.arange(n) + 0.5) * depth / n, 4 * ALPHA * round(seconds / dt) * dt
@@ -123,7 +124,7 @@ def thick_solid(seconds: float, flux: float = 5000.0, depth: float = 0.2, n: int
 
 @oracle(
     "A thick solid's surface under a constant flux, after {seconds:g} s", "ΔT = 2q/k √(αt/π)", "Carslaw and Jaeger 2.9",
-    "rise of temperature [K]", at=["surface"], rtol=0.01, each=[10.0], also=[1.0],
+    "rise of temperature [K]", at=["surface"], rtol=0.01, each=[10.0], also=[1.0, 4.0],
 )  # fmt: skip
 def thick_solids_surface(seconds: float, flux: float = 5000.0, depth: float = 0.2, n: int = 200):
     ours = risen(seconds, flux, depth, n)[0] + flux * 0.5 * depth / n / STEEL.conductivity
@@ -151,7 +152,7 @@ def effusivity(material: dict[str, Any]) -> float:
 
 @oracle(
     "Two bodies in contact, after {seconds:g} s", "T_c = (e₁T₁ + e₂T₂)/(e₁ + e₂), ΔT = ΔT_c erfc(x/√4αt), e = √(kρc)",
-    "Carslaw and Jaeger 2.14", "rise of temperature [K]", "depth [m]", defects=(13,), each=[100],
+    "Carslaw and Jaeger 2.14", "rise of temperature [K]", "depth [m]", defects=(13,), each=[100], also=[40],
 )  # fmt: skip
 def two_bodies(steps: int, dt: float = 0.005):
     rise = 23.0 * effusivity(HARD_RUBBER) / (effusivity(ALLOY) + effusivity(HARD_RUBBER))
@@ -185,7 +186,7 @@ def two_solids(cell: float, num: int, dt: float = 0.005, seconds: float = 0.4):
 
 @oracle(
     "Heat through a spot in long steps, αΔt/Δ² = {fourier:.2g}", "Q", "the same cells in steps of 25 ms", "heat [J]",
-    at=["after {seconds:g} s"], rtol=0.01, defects=(13,), each=[(8, 0.2)], also=[(12, 1.0)],
+    at=["after {seconds:g} s"], rtol=0.01, defects=(13,), each=[(8, 0.2)], also=[(4, 1.0), (12, 1.0)],
 )  # fmt: skip
 def spot_in_long_steps(num: int, dt: float, seconds: float = 1.0):
     sensor = {"cells": [num] * 3, "material": "aluminium", "contact_area": "10 mm2"}

@@ -107,7 +107,7 @@ def flat_pad():
 
 @oracle(
     "Winkler: a ball on a dense pad, α = {alpha:g}", "F = k 2πB δ^(α+1)/((α+1) A)", "Johnson 1985, 4.3, of a power law",
-    "force [N]", "depth [m]", is_log=True, rtol=0.02, defects=(1,), each=[1.0, 1.2],
+    "force [N]", "depth [m]", is_log=True, rtol=0.02, defects=(1,), each=[1.0, 1.2], also=[1.5],
 )  # fmt: skip
 def winkler(alpha: float):
     # Probes of radius R below the skin, a taxel on each area A. Of one at r from the axis the geometric depth is

@@ -93,7 +93,7 @@ def made_of(material: Material, num_modes: int = 8) -> ShapeModes:
     return ShapeModes.model_construct(material=material, count=num_modes)
 
 
-SCALES = (0.3, 17.0)
+SCALES = (1.0, 0.3, 17.0)
 
 
 @oracle(

@@ -135,7 +135,7 @@ def radii(width: float = 0.3 * MM):
 
 @statistics(
     "Ages of readings with jitter are uniform, calls every {dt:ms}", "U(Δ, Δ + J)", "uniform distribution",
-    each=[DT / 0.1, DT / 1.0],
+    each=[DT / 0.1, DT / 1.0], also=[DT / 2.0, DT / 10.0],
 )  # fmt: skip
 def ages(dt: float, num_envs: int = 5000):
     low, high, sample = 10e-3, 18e-3, []

@@ -57,7 +57,7 @@ def ring_down(dtype: torch.dtype):
 
 @contact(
     "Two modes ring for 1,000,000 samples", "s = J Σ g e^(−dt) sin 2πft", IMPULSE_RESPONSE, "velocity of the surface [m/s]",
-    "time [s]", each=[], also=[torch.float32],
+    "time [s]", each=[], also=[torch.float64, torch.float32],
 )  # fmt: skip
 def million_samples(dtype: torch.dtype):
     modes, step = [{"frequency": 437.1, "decay": 1.0, "gain": 1.0}, {"frequency": 12345.6, "decay": 0.4, "gain": 0.5}], 0.05
@@ -114,7 +114,7 @@ def common_times(samples: int):
 
 @contact(
     "A collision of {duration:ms} strikes once, with its impulse, at any time step", "J = ∫F dt", "momentum", "impulse [N·s]",
-    "time step [s]", is_log=True, each=[0.0005, 0.002], slow=[0.002],
+    "time step [s]", is_log=True, each=[0.0005, 0.002], also=[0.004], slow=[0.002],
 )  # fmt: skip
 def collision(duration: float):
     modes, ours, paper = [{"frequency": 1000.0, "decay": 10.0, "gain": 1.0}], [], []
@@ -159,7 +159,7 @@ def scraping(num_envs: int = 400, num_steps: int = 90):
 @contact(
     "Scraping is white noise to modes {apart} Hz apart", "E|z|² = m_s W/2d, E z₁z₂* = m_s W/(2d − i(ω₁ − ω₂))",
     "Campbell's theorem of shot noise", "mean square, correlations, over m_s W/2d [1]",
-    at=["mode 1", "mode 2", "z₁z₂*", "z₁z₂"], atol=0.07, each=[4000.0, 2800.0], also=[250.0],
+    at=["mode 1", "mode 2", "z₁z₂*", "z₁z₂"], atol=0.07, each=[4000.0, 2800.0], also=[250.0, 1000.0],
 )  # fmt: skip
 def independent_modes(apart: float, num_envs: int = 4000, num_steps: int = 60):
     decay, scrape, force, speed = 60.0, 1e-3, 2.0, 0.5
@@ -237,6 +237,7 @@ def fading():
 
 @motors(
     "A motor hums at rest", "s = a sin 2πft", "by definition", "pressure at 1 m [Pa]", "time [s]", atol=1e-9, each=[40],
+    also=[200],
 )  # fmt: skip
 def hum(num_steps: int):
     time = times(20, num_steps)

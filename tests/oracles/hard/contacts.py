@@ -20,7 +20,7 @@ from oracles.setups.signals import Noise, one
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 
-STEPS = (1e-6, 1e-2, 10.0)
+STEPS = (1e-6, 1e-4, 1e-2, 1.0, 10.0)
 """Seconds between calls."""
 hard = partial(case.hard, "contacts, time and memory")
 

@@ -13,10 +13,10 @@ from oracles.setups.scenes import compiled, folder, temporary
 from tgdsl.fields.materials import MATERIALS
 from tgdsl.module.module import TactileModule
 
-STEPS = (1e-4, 10.0)
-"""Shortest and longest seconds between calls."""
+STEPS = (1e-4, 0.01, 1.0, 10.0)
+"""Seconds between calls."""
 ONE_CONTACT = [((0, 0, 0.005), (0, 0, -1), 2.0)]
-GRID = list(itertools.product(STEPS, (0.1, 400.0), (1e-9, 1e-2)))
+GRID = list(itertools.product(STEPS, (0.1, 400.0), (1e-9, 1e-5, 1e-2)))
 """Step [s], conductivity [W/(m·K)] and contact area [m²]."""
 hard = partial(case.hard, "heat")
 

@@ -16,7 +16,7 @@ from tgdsl.quantities.contacts import SLOT_FIELDS
 from tgdsl.sensors import KINDS
 
 NAMES = tuple(kind.name for kind in KINDS)
-NUM_ENVS, NUM_CALLS = 2, 3
+NUM_ENVS, NUM_CALLS = 4, 3
 FLOAT32, FLOAT64, FAR = 1e-5, 1e-11, 1e-9
 """Largest error over the channel's largest magnitude: 80 float32 roundings; rounding; 1 km away."""
 READ_BY = {"contact_audio": ("contact_force",), "actuation_audio": ("joint_vel",)}
@@ -41,9 +41,7 @@ def _scaled(factor: float, *names: str) -> Change:
 
 def _any_length(state: SceneState) -> SceneState:
     factors = torch.tensor([1e-3, 0.5, 1 + 1e-6, 40.0], dtype=torch.float64)
-    num_envs, num_bodies, _ = state.body_quat.shape
-    each = factors[torch.arange(num_envs * num_bodies) % 4].view(num_envs, num_bodies, 1)
-    return dataclasses.replace(state, body_quat=state.body_quat * each)
+    return dataclasses.replace(state, body_quat=state.body_quat * factors[: len(state.body_quat), None, None])
 
 
 def _opposing(state: SceneState) -> SceneState:
@@ -146,7 +144,7 @@ def split_batches(dtype: torch.dtype, kind: str, num_envs: int = 3):
     "{num_envs:,} environments", "indices overflow, or an environment reads another's row", "three environments alone",
     "of full scale", float64=None, float32=1e-6,
 )  # fmt: skip
-def many_environments(dtype: torch.dtype, kind: str, num_envs: int = 512):
+def many_environments(dtype: torch.dtype, kind: str, num_envs: int = 4096):
     many, few = pair_of(kind, dtype).module, pair_of(kind, dtype).module
     state = many.example_state(num_envs, seed=0)
     with quiet():
