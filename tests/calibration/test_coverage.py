@@ -40,7 +40,7 @@ class Case(NamedTuple):
     true: dict[str, float]
     lower: float = 0.0
     untold: tuple[str, ...] = ()
-    num_tested: int = 3
+    num_tested: int = 6
 
 
 def on_pad(kind: str, **keys: Any) -> dict[str, dict[str, Any]]:
