@@ -32,8 +32,8 @@ PYTEST = OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --nu
 test: $(READY)
 	@$(PYTEST) -m "not slow"
 
-# The rest: each kind compiled by itself, learning, the physics of tasks, the wheel; and calls with their types and shapes checked.
-# Kernels run in processes that check no types.
+# The rest: oracles, each kind compiled by itself, learning, the physics of tasks, the wheel; and calls with their types and
+# shapes checked. Kernels run in processes that check no types.
 test-full: $(READY)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m browser
 	@$(PYTEST) -m "slow and not browser"

@@ -43,6 +43,8 @@ ROW = Row(
     transient=None,
     seconds=1.0,
 )
+DRY = ["--device", "cpu", "--eager", "--sets", "2", "--repeats", "1"]
+"""Arguments of a run without a GPU."""
 
 
 def module_of(name, tmp_path):
@@ -176,22 +178,9 @@ class TestGuard:
     def test_a_dry_run_keeps_ratios_and_compares_them(self, tmp_path, capsys, monkeypatch):
         make_artefacts(tmp_path / "art", [CASES["depth"]])
         file = tmp_path / "kept.json"
-        arguments = [
-            "--device",
-            "cpu",
-            "--eager",
-            "--sets",
-            "2",
-            "--repeats",
-            "1",
-            "--check-envs",
-            "2",
-            "--envs",
-            "3",
-            "--rows",
-            "depth",
-        ]
-        command = ["guard", str(tmp_path / "art"), "--out", str(tmp_path / "rows.json"), "--kept", str(file), *arguments]
+        files = ["--out", str(tmp_path / "rows.json"), "--kept", str(file)]
+        rows = ["--check-envs", "2", "--envs", "3", "--rows", "depth"]
+        command = ["guard", str(tmp_path / "art"), *files, *DRY, *rows]
         options = gpu.parsed([*command, "--keep"])
         with pytest.raises(SystemExit, match="0"):
             options.call(options)
@@ -244,21 +233,8 @@ def test_a_dry_run_measures_writes_and_draws(tmp_path, capsys):
     """A row without an artefact fails, and the others go on."""
     names, results = ["depth", "kinematic-noisy"], tmp_path / "gpu.json"
     make_artefacts(tmp_path / "art", [CASES[name] for name in names])
-    arguments = [
-        "--device",
-        "cpu",
-        "--eager",
-        "--sets",
-        "2",
-        "--repeats",
-        "1",
-        "--check-envs",
-        "4",
-        "--rows",
-        "kinematic",
-        *names,
-    ]
-    options = gpu.parsed(["run", str(tmp_path / "art"), "--out", str(results), *arguments, "--envs", "3", "5"])
+    rows = ["--check-envs", "4", "--envs", "3", "5", "--rows", "kinematic", *names]
+    options = gpu.parsed(["run", str(tmp_path / "art"), "--out", str(results), *DRY, *rows])
     options.call(options)
     output = capsys.readouterr().out
     assert "kinematic: FAILED" in output and "kinematic.safetensors" in output
