@@ -119,7 +119,7 @@ class Elements:
         weight = _shape_functions(within)[0].T.ravel()
         starts = NODES * np.arange(len(cell) + 1)
         weights = csr_array((weight, self.nodes[cell].ravel(), starts), shape=(len(cell), len(self.pos)))
-        return (weights @ values.reshape(len(self.pos), -1)).reshape(len(cell), 3, -1)
+        return (weights @ values.reshape(len(self.pos), -1)).reshape(len(cell), 3, values.shape[1])
 
 
 SHIFT = -1e-3  # shift of the eigenvalues: below all of them, so that the factorised matrix is positive definite
