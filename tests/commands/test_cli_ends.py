@@ -4,6 +4,7 @@ import os
 import resource
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -110,13 +111,17 @@ def test_output_to_a_full_disk(tmp_path, arguments):
 # Files that cannot be written
 
 
-@pytest.fixture
-def limit_files(monkeypatch):
-    """Return a function that limits the size of each file that this process writes."""
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # Python would keep the first bytes of a module's bytecode
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    yield lambda num_bytes: resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, limits[1]))
-    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+@contextmanager
+def files_of_at_most(num_bytes):
+    """Limit the size of each file that this process writes inside, and no longer: coverage writes files between the phases of a test."""
+    limits, keeps_no_bytecode = resource.getrlimit(resource.RLIMIT_FSIZE), sys.dont_write_bytecode
+    sys.dont_write_bytecode = True  # Python would keep the first bytes of a module's bytecode
+    resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        sys.dont_write_bytecode = keeps_no_bytecode
 
 
 @pytest.mark.parametrize(
@@ -129,17 +134,17 @@ def limit_files(monkeypatch):
         (("import", "cube.usda"), "cube.xml"),
     ],
 )
-def test_a_file_that_grows_too_large_is_named_and_removed(base, here, limit_files, arguments, file):
+def test_a_file_that_grows_too_large_is_named_and_removed(base, here, arguments, file):
     files_before = files_in(base)
-    limit_files(100)
-    code, _, error = here(base, *arguments)
+    with files_of_at_most(100):
+        code, _, error = here(base, *arguments)
     assert (code, error.splitlines()[-1]) == (2, f"tgdsl: {file}: File too large")
     assert files_in(base) == files_before
 
 
-def test_a_picture_that_grows_too_large(base, here, limit_files):
-    limit_files(3000)
-    code, _, error = here(base, "run", "pad.yaml", "--seconds", "0.05")
+def test_a_picture_that_grows_too_large(base, here):
+    with files_of_at_most(3000):
+        code, _, error = here(base, "run", "pad.yaml", "--seconds", "0.05")
     assert (code, error.splitlines()[-1]) == (2, "tgdsl: out/picture.png: File too large")
     assert files_in(base / "out") == ["readings.npz"]
 
