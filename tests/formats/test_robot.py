@@ -36,11 +36,12 @@ PRIMITIVES = {
 """Size, volume [m³], area [m²] (none: no elementary formula) and half extents [m] of each."""
 
 
-@pytest.mark.parametrize("mount", ["", MOUNT], ids=["at_origin", "mounted"])
+@pytest.mark.parametrize(("mount", "scale"), [("", 1.0), (MOUNT, 1.0), ("", 0.02)], ids=["at_origin", "mounted", "tiny"])
 @pytest.mark.parametrize("shape", PRIMITIVES)
-def test_surfaces_of_primitives(tmp_path, shape, mount):
+def test_surfaces_of_primitives(tmp_path, shape, mount, scale):
     size, volume, area, half = PRIMITIVES[shape]
-    text = " ".join(map(str, size))
+    volume, area, half = scale**3 * volume, area and scale**2 * area, scale * np.array(half)
+    text = " ".join(str(scale * length) for length in size)
     mesh = trimesh_of(model_of(tmp_path, f"<geom type='{shape}' size='{text}' {mount}/>"))
     assert mesh.is_watertight
     assert mesh.is_winding_consistent
@@ -50,7 +51,7 @@ def test_surfaces_of_primitives(tmp_path, shape, mount):
     pos, rotation = (MOUNT_POS, MOUNT_ROTATION) if mount else (np.zeros(3), np.eye(3))
     local = (mesh.vertices - pos) @ rotation
     np.testing.assert_allclose(local.max(axis=0), half, rtol=2e-3)
-    np.testing.assert_allclose(local.min(axis=0), -np.array(half), rtol=2e-3)
+    np.testing.assert_allclose(local.min(axis=0), -half, rtol=2e-3)
     np.testing.assert_allclose(mesh.center_mass, pos, atol=1e-6)
 
 

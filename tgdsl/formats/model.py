@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import mujoco
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from tgdsl.errors import RobotError
 from tgdsl.scene.mujoco_warnings import muted_mujoco
-from tgdsl.surfaces.geom import Geom
+from tgdsl.surfaces.geom import Geom, round_shape
 from tgdsl.surfaces.surface import Surface
 
 LEAST_INERTIA = 1e-9  # least principal moment of a body whose inertia in the file is not physical [kg·m²]
@@ -179,22 +179,31 @@ class Model:
         return _surface(hull.vertices, hull.faces, geom)
 
     def _tessellated(self, geom: Geom) -> Surface:
-        import trimesh
-
-        if geom.shape == "box":
-            mesh = trimesh.creation.box(2 * geom.size)
-        elif geom.shape == "sphere":
-            mesh = trimesh.creation.icosphere(subdivisions=4, radius=geom.size[0])
-        elif geom.shape == "ellipsoid":
-            mesh = trimesh.creation.icosphere(subdivisions=4).apply_scale(geom.size)
-        elif geom.shape == "cylinder":
-            mesh = trimesh.creation.cylinder(geom.size[0], 2 * geom.size[1], sections=96)
-        elif geom.shape == "capsule":
-            mesh = trimesh.creation.capsule(2 * geom.size[1], geom.size[0], count=[64, 64])
-            mesh.apply_translation([0, 0, -mesh.bounds.mean(axis=0)[2]])
-        else:
+        tessellation = _tessellation(geom.shape, tuple(geom.size.tolist()))
+        if tessellation is None:
             raise RobotError(f"{self.file}: {geom.shown} of body {geom.body} has no bounded surface to put taxels on")
-        return _surface(mesh.vertices, mesh.faces, geom)
+        return _surface(*tessellation, geom)
+
+
+@lru_cache(maxsize=256)
+def _tessellation(shape: str, size: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the vertices [m] and faces of a primitive; None for other shapes."""
+    import trimesh
+
+    if shape == "box":
+        mesh = trimesh.creation.box(2 * np.array(size))
+    elif shape == "sphere":
+        mesh = trimesh.creation.icosphere(subdivisions=4, radius=size[0])
+    elif shape == "ellipsoid":
+        mesh = trimesh.creation.icosphere(subdivisions=4).apply_scale(size)
+    elif shape == "cylinder":
+        mesh = round_shape(trimesh.creation.cylinder, size, sections=96)
+    elif shape == "capsule":
+        mesh = round_shape(trimesh.creation.capsule, size, count=[64, 64])
+        mesh.apply_translation([0, 0, -mesh.bounds.mean(axis=0)[2]])
+    else:
+        return None
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
 def _surface(vertices: np.ndarray, faces: np.ndarray, geom: Geom) -> Surface:

@@ -82,7 +82,10 @@ class Colliders:
     def are_inside(self, solids: Int[np.ndarray, " solid"], pos: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Return which points of the world are inside any of some solids."""
         result = np.zeros(len(pos), dtype=bool)
+        low, high = pos.min(axis=0, initial=np.inf), pos.max(axis=0, initial=-np.inf)
         for i in solids:
+            if self.solids[i].is_beyond(low, high):
+                continue
             rest = np.flatnonzero(~result)
             result[rest] = self.solids[i].depth(pos[rest]) > INSIDE
         return result

@@ -35,12 +35,19 @@ class ConvexSolid:
 
         Outside it is negative: the point is at least as far away, and −∞ says that it is outside the bounding box.
         """
+        depth = np.full(len(pos), -np.inf)
         local = (pos - self.pos) @ self.rotation
-        depth = np.full(len(local), -np.inf)
-        near = np.flatnonzero(((local >= self.low - SLACK) & (local <= self.high + SLACK)).all(axis=1))
+        in_box = (local >= self.low - SLACK) & (local <= self.high + SLACK)
+        near = np.flatnonzero(in_box[:, 0] & in_box[:, 1] & in_box[:, 2])  # faster than a reduction over so short an axis
         if len(near):
             depth[near] = self._from_planes(local[near]) if len(self.planes) else -self._distance(local[near])
         return depth
+
+    def is_beyond(self, low: Float[np.ndarray, " 3"], high: Float[np.ndarray, " 3"]) -> bool:
+        """Return whether a box of the outer frame [m] misses the sphere around the solid's bounding box."""
+        middle = self.pos + self.rotation @ (0.5 * (self.low + self.high))
+        gap = np.linalg.norm(np.maximum(np.maximum(low - middle, middle - high), 0.0))
+        return bool(gap > 0.5 * np.linalg.norm(self.high - self.low) + 2.0 * SLACK)
 
     def _from_planes(self, pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Return the distance from the nearest face's plane, which is the surface's for points inside."""

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from tgdsl.surfaces.surface import Surface
+
+_LARGE = 1024.0  # scale at which trimesh makes round shapes: a power of two keeps the bits of their vertices
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,3 +56,11 @@ class SurfaceGeom:
     def shape(self) -> str:
         """The primitive's type, or `mesh`."""
         return self.geom.shape if self.surface is None else "mesh"
+
+
+def round_shape(make: Callable[..., Any], size: Sequence[float], **detail: Any) -> Any:
+    """Return trimesh's mesh of a capsule or a cylinder of some radius and half length [m], without holes.
+
+    trimesh drops triangles below 1e-8 m², such as those near the ends of a capsule of 9 mm.
+    """
+    return make(radius=_LARGE * size[0], height=2 * _LARGE * size[1], **detail).apply_scale(1 / _LARGE)

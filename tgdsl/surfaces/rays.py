@@ -123,7 +123,7 @@ def is_clear(view: OrthographicView, uvt: Float[np.ndarray, "ray 3"]) -> Bool[np
     result, (a, b, c) = np.ones(len(uvt), dtype=bool), view.corners[:, :, 2].T
     nearest = np.minimum(np.minimum(a, b), c)
     for face, ray in _pairs(view, uvt[:, :2]):
-        is_before = nearest[face] < uvt[ray, 2]
+        is_before = result[ray] & (nearest[face] < uvt[ray, 2])
         _, ray, t = _hits(view, uvt[:, :2], face[is_before], ray[is_before])
         result[ray[t < uvt[ray, 2]]] = False
     return result

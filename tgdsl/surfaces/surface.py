@@ -42,6 +42,16 @@ class Surface:
         length = np.linalg.norm(self._cross, axis=1, keepdims=True)
         return np.divide(self._cross, length, out=np.zeros_like(self._cross), where=length > 0)
 
+    @cached_property
+    def hull_area(self) -> float:
+        """Area of the surface's convex hull [m²]; infinite if it is flat."""
+        from scipy.spatial import ConvexHull, QhullError  # takes 0.3 s, and compiled modules do not need it
+
+        try:
+            return float(ConvexHull(self.vertices[np.unique(self.faces)]).area)
+        except QhullError:
+            return np.inf
+
     def keep(self, faces: Bool[np.ndarray, " f"]) -> Surface:
         """Return the surface of some of the faces; vertices and geoms stay."""
         return Surface(self.vertices, self.faces[faces], self.face_geom[faces], self.geoms)

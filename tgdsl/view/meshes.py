@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from tgdsl.layout.layout import Link
 from tgdsl.scene.scene import is_absent
+from tgdsl.surfaces.geom import round_shape
 from tgdsl.view.markers import Pose
 from tgdsl.view.raster import Mesh
 
@@ -26,8 +27,8 @@ _PRIMITIVES = {
     GeomType.mjGEOM_BOX: lambda size: trimesh.creation.box(2 * size),
     GeomType.mjGEOM_SPHERE: lambda size: trimesh.creation.icosphere(subdivisions=3, radius=size[0]),
     GeomType.mjGEOM_ELLIPSOID: lambda size: trimesh.creation.icosphere(subdivisions=3).apply_scale(size),
-    GeomType.mjGEOM_CYLINDER: lambda size: trimesh.creation.cylinder(size[0], 2 * size[1], sections=64),
-    GeomType.mjGEOM_CAPSULE: lambda size: trimesh.creation.capsule(2 * size[1], size[0], count=[32, 32]),
+    GeomType.mjGEOM_CYLINDER: lambda size: round_shape(trimesh.creation.cylinder, size, sections=64),
+    GeomType.mjGEOM_CAPSULE: lambda size: round_shape(trimesh.creation.capsule, size, count=[32, 32]),
 }
 
 

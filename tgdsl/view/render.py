@@ -51,7 +51,7 @@ def render(model: mujoco.MjModel, layouts: Mapping[str, Layout], out: Path, **op
     """Write `drawing` as a PNG file; return the path. A file that cannot be written is a `ViewError`."""
     try:
         check_writable(out)
-        return save_figure(drawing(model, layouts, **options), out, pil_kwargs={"optimize": True})
+        return save_figure(drawing(model, layouts, **options), out)
     except FileError as error:
         raise ViewError(f"cannot write {error}") from error
 

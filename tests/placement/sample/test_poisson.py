@@ -134,6 +134,17 @@ def test_visible_points_of_closed_meshes_need_no_winding_numbers(monkeypatch):
     assert sum(num_asked) < 0.5 * len(samples.pos)
 
 
+def test_points_inside_other_solids_are_viewed_from_one_direction(monkeypatch):
+    num_rays, is_clear = [], poisson.is_clear
+    monkeypatch.setattr(poisson, "is_clear", lambda view, rays: num_rays.append(len(rays)) or is_clear(view, rays))
+    balls = [ball(0.01), ball(0.01).apply_translation([0.004, 0, 0])]
+    shell = meshlab.outer_shell(surface_of(*balls))
+    pool = poisson.pool(shell, Region(None, (), (), ()), seed=0, count=1, spacing=None)
+    assert pool is not None
+    num_drawn = len(pool.pos) * sum(each.area for each in balls) / pool.area  # 40 % are in the other ball
+    assert sum(num_rays) < 1.2 * num_drawn
+
+
 def test_poisson_on_open_meshes():
     bowl = ball(0.01)
     bowl.update_faces(bowl.triangles_center[:, 2] > 0)

@@ -21,7 +21,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, QhullError
 
 from tgdsl.formats.model import Model
 from tgdsl.surfaces.surface import Surface
@@ -109,7 +108,7 @@ class KinematicTree:
     @cached_property
     def area(self) -> dict[int, float]:
         """Surface of each body that has one [m²]; at most its convex hull's, as geoms may overlap."""
-        return {body: min(float(surface.face_areas.sum()), _hull_area(surface)) for body, surface in self.surface.items()}
+        return {body: min(float(surface.face_areas.sum()), surface.hull_area) for body, surface in self.surface.items()}
 
     @cached_property
     def centroid(self) -> dict[int, Float[np.ndarray, " 3"]]:
@@ -247,14 +246,6 @@ def kinematic_tree(robot: Model, surface: Mapping[str, Surface]) -> KinematicTre
 
 def _rigid(model: mujoco.MjModel) -> list[int]:
     return [w or r for w, r in zip(model.body_weldid.tolist(), model.body_rootid.tolist(), strict=True)]
-
-
-def _hull_area(surface: Surface) -> float:
-    """Return the area of a surface's convex hull [m²]; infinite if it is flat."""
-    try:
-        return float(ConvexHull(surface.vertices[np.unique(surface.faces)]).area)
-    except QhullError:
-        return np.inf
 
 
 def free_standing(tree: KinematicTree) -> list[int]:

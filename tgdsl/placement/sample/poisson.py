@@ -31,8 +31,8 @@ from tgdsl.surfaces.surface import Surface
 
 CANDIDATES = 20  # least number of points per sample from which an exact count is chosen
 DIRECTIONS, FIRST_DIRECTIONS = 100, 10
-"""View directions: a point that none of them sees is in a pocket that nothing outside can touch. Points that the first ones
-do not see are first tested for being inside of solids, then viewed from the other directions."""
+"""View directions: a point that none of them sees is in a pocket that nothing outside can touch. Each point is first viewed
+from one of the first ones. If it is hidden there, it is tested for being inside of solids, then viewed from all directions."""
 PER_SAMPLE = 50  # points per sample by which the area of each sample is measured; also the density of the pool for a spacing
 MIN_POOL, MAX_POOL = 10_000, 400_000  # points in a pool; more are drawn only where an exact count needs them
 MANY = 30  # points from which on a piece's area is corrected for this piece alone
@@ -152,7 +152,7 @@ def _on_outer_surface(
     is_geom = np.ones(len(shell.surface.geoms), bool) if region.is_geom is None else region.is_geom
     is_out = np.ones(len(pos), dtype=bool)
     directions = sphere_directions(DIRECTIONS)
-    is_seen = _visible(shell, above, normal, directions[:FIRST_DIRECTIONS])
+    is_seen = _visible(shell, above, normal, directions[:FIRST_DIRECTIONS], (True,))
     for solid in np.flatnonzero(shell.is_solid).tolist():
         doubtful = np.flatnonzero(is_out & ~(is_seen & shell.is_closed[solid]))  # nothing seen is inside a closed surface
         is_out[doubtful] = shell.winding(solid, above[doubtful]) < 0.5
@@ -160,7 +160,7 @@ def _on_outer_surface(
             later = np.flatnonzero(is_out & (component > solid))
             is_out[later] = shell.winding(solid, below[later]) < 0.5
     left = np.flatnonzero(is_out & ~is_seen)
-    is_out[left] = _visible(shell, above[left], normal[left], directions[FIRST_DIRECTIONS:])
+    is_out[left] = _visible(shell, above[left], normal[left], directions)
     return is_out
 
 
@@ -169,12 +169,15 @@ def _visible(
     above: Float[np.ndarray, "n 3"],
     normal: Float[np.ndarray, "n 3"],
     directions: Float[np.ndarray, "direction 3"],
+    passes: tuple[bool, ...] = (True, False),
 ) -> Bool[np.ndarray, " n"]:
-    """Return which points just above faces are visible from far away along some direction."""
-    # Most points are seen along the direction that is most opposed to their normal, so each is viewed from there first.
+    """Return which points just above faces are visible from far away along some direction.
+
+    The first pass views each point along the direction that is most opposed to its normal, the second along all others.
+    """
     cosine = normal @ directions.T
     opposed, is_visible = cosine.argmin(axis=1), np.zeros(len(above), dtype=bool)
-    for is_first in (True, False):
+    for is_first in passes:
         for i, direction in enumerate(directions):
             left = np.flatnonzero(~is_visible & (cosine[:, i] < -0.05) & ((opposed == i) == is_first))
             if len(left):
