@@ -65,9 +65,10 @@ def test_environments_counts_and_memory(touch):
     state = touch.example_state(2)
     with pytest.raises(StateError, match="memory: found NoneType, expected `initial_memory`, or what the step before returned"):
         touch.step(state, None)
-    with pytest.raises(StateError, match=r"env_ids: found 'all', expected indices"):
-        touch.reset("all")
-    touch.reset([0])  # before the first call every environment begins an episode
+    for wrong, found in (("all", "'all'"), ([-1], "-1"), ([0.5], "0.5"), ([[0, 1]], "0, 1")):
+        with pytest.raises(StateError, match=rf"env_ids: found {found}, expected indices of environments from 0, or a mask"):
+            touch.reset(wrong)
+    touch.reset([7])  # before the first call any number of environments is possible
     with pytest.raises(SimulationError, match=r"^num_envs is '2', expected a whole number of at least 1$"):
         tgdsl.simulate(touch, "2")  # type: ignore[arg-type]
     with closing(tgdsl.simulate(touch, 2, device=torch.device("cpu"))) as sim:

@@ -151,6 +151,11 @@ def test_overrides_replace_values(tmp_path):
             "--set sensors.touch.gate=far: sensors.touch.gate: found \"far\", expected 'contact_pair' or 'geometric'",
         ),
         ("sensors.touch", "{kind: contact}", '--set sensors.touch={kind: contact}: sensors.touch: missing key "links"'),
+        (
+            "sensors.tuch.noise",
+            "clean",
+            '--set sensors.tuch.noise=clean: sensors.tuch: missing key "kind"; "tuch" is new: did you mean "touch"?',
+        ),
         ("tgdsl.x", "1", "--set tgdsl.x=1: tgdsl.x: does not lead to a key of a mapping"),
         ("sensors.touch.feels.0", "cube", None),
         ("resolution", "", "--set resolution=:1:1: the document is empty"),

@@ -350,14 +350,15 @@ class TactileModule(HookedModule):
         """Begin a new episode in some environments (default: all), given as indices or a mask.
 
         State returns to rest, filters start from the next reading's true value, and gains, dead taxels and other noise per
-        episode are drawn again. Indices on a GPU are checked by an assertion in the kernel.
+        episode are drawn again. Indices on a GPU are checked by an assertion in the kernel. A module without state has nothing
+        to restart, and before the first call no number of environments: any index from 0 is valid then, and nothing changes.
 
         Raises:
             StateError: If there are no such environments.
         """
         if self.num_envs is None:
             check_env_ids(env_ids, StateError)
-            return  # there is no state yet, and the first call begins an episode
+            return
         with torch.no_grad():
             self.memory.reset(env_mask(env_ids, self.num_envs, self.device, StateError, waits=False))
 

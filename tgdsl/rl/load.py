@@ -85,7 +85,7 @@ def load_task(document: str | PathLike[str] | Mapping[str, Any], overrides: Mapp
         named = {**train_groups(spec), ("distill", "groups"): spec.distill.groups}
         problems += wrong_groups(source, named, [*SHARED_GROUPS, *added, *task.own_groups])
     if problems or not isinstance(spec, TaskSpec):
-        raise SpecError(problems)
+        raise SpecError(source.hinted(problems))
     return LoadedTask(spec, task, source, folder, terms)
 
 

@@ -137,6 +137,7 @@ def load(
     problems = list(source.problems)
     required = ("tgdsl", "robot", "sensors") if needs_sensors else ("tgdsl", "robot")
     spec = validate(source, (), document_model(kinds, needs_sensors), problems, required)
+    problems = source.hinted(problems)
     if spec is None:
         raise SpecError(problems)
     loaded = Loaded(spec=spec, source=source, folder=folder, problems=problems)

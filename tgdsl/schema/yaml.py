@@ -6,7 +6,7 @@ import pathlib
 import warnings
 from collections.abc import Collection, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from io import StringIO
 from typing import Any, NamedTuple
@@ -45,6 +45,9 @@ class Source:
     keys: dict[Path, Mark] = field(default_factory=dict)  # place of the key of each mapping entry, by its path
     values: dict[Path, Mark] = field(default_factory=dict)  # place of each value, by its path
     problems: list[Problem] = field(default_factory=list)
+    added: dict[str, str] = field(
+        default_factory=dict
+    )  # paths that overrides began, with a hint if a sibling has a similar name
 
     def problem(self, path: Path, what: str, hint: str = "", on_key: bool = False) -> Problem:
         """Return a mistake at a path, placed at the nearest part of it that the document holds."""
@@ -54,6 +57,15 @@ class Source:
             near = near[:-1]
         mark = first.get(near) or second.get(near) or Mark(self.file, 0, 0)
         return Problem(*mark, path=path_text(path), what=what, hint=hint)
+
+    def hinted(self, problems: Sequence[Problem]) -> list[Problem]:
+        """Return mistakes; those in entries that overrides added name a similar entry."""
+        result = list(problems)
+        for i, problem in enumerate(problems):
+            hints = [hint for path, hint in self.added.items() if f"{problem.path}.".startswith(f"{path}.")]
+            if hints and not problem.hint.startswith("did you mean"):
+                result[i] = replace(problem, hint=hints[0])
+        return result
 
     def get(self, path: Path) -> Any:
         """Return the plain value at a path, or None."""
@@ -85,6 +97,9 @@ class Source:
         parent = self.value
         for i, part in enumerate(path[:-1]):
             if isinstance(parent, dict) and part not in parent:
+                near = did_you_mean(str(part), map(str, parent))
+                if near.startswith("did"):
+                    self.added[path_text(path[: i + 1])] = f'"{part}" is new: {near}'
                 parent[part] = {}
                 self.values[path[: i + 1]] = Mark(parsed.file, 0, 0)
             parent = parent[part] if isinstance(parent, dict) else None

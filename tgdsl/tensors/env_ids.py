@@ -17,9 +17,13 @@ FEW = 0.5  # with more of the environments than this share, something is done fo
 
 
 def check_env_ids(env_ids: EnvIds | None, error: type[TgdslError]) -> None:
-    """Raise an error if environments, of a number that is not known yet, are named neither by indices nor by a mask."""
-    if env_ids is not None:
-        _ids_tensor(env_ids, None, error)
+    """Raise an error if environments, whose number is not known, are named neither by indices from 0 nor by a mask."""
+    if env_ids is None:
+        return
+    ids = _ids_tensor(env_ids, None, error)
+    is_some = ids.ndim == 1 and (ids.dtype == torch.bool or _are_indices(ids))
+    if ids.numel() and not (is_some and (ids.is_cuda or bool((ids >= 0).all()))):
+        raise error(f"env_ids: found {listed([str(value) for value in ids.flatten().tolist()])}, {_expected_ids(None)}")
 
 
 def env_indices(env_ids: EnvIds | None, num_envs: int, error: type[TgdslError] = SimulationError) -> Int[np.ndarray, " n"]:
@@ -59,9 +63,14 @@ def _ids_tensor(env_ids: EnvIds, num_envs: int | None, error: type[TgdslError]) 
         raise error(f"env_ids: found {env_ids!r}, {_expected_ids(num_envs)}") from wrong
 
 
+def _are_indices(ids: Tensor) -> bool:
+    """Return whether numbers can be indices; of 8 bits they are rather a mask that is not boolean."""
+    return not ids.is_floating_point() and not ids.is_complex() and ids.element_size() > 1
+
+
 def _expected_ids(num_envs: int | None) -> str:
     if num_envs is None:
-        return "expected indices of environments, or a mask of them"
+        return "expected indices of environments from 0, or a mask of them"
     return f"expected indices from 0 to {num_envs - 1}, or a mask of {num_envs}"
 
 
