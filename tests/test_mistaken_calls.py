@@ -65,6 +65,7 @@ def test_environments_counts_and_memory(touch):
     state = touch.example_state(2)
     with pytest.raises(StateError, match="memory: found NoneType, expected `initial_memory`, or what the step before returned"):
         touch.step(state, None)
+    touch.free()  # of the calls of other tests
     for wrong, found in (("all", "'all'"), ([-1], "-1"), ([0.5], "0.5"), ([[0, 1]], "0, 1")):
         with pytest.raises(StateError, match=rf"env_ids: found {found}, expected indices of environments from 0, or a mask"):
             touch.reset(wrong)
