@@ -17,10 +17,12 @@ from mjlab.managers.observation_manager import ObservationGroupCfg, ObservationT
 from mjlab.managers.reward_manager import RewardTermCfg
 from mjlab.scene import SceneCfg
 from mjlab.sim import MujocoCfg, SimulationCfg
+from recorded_captures import Recorder
 
 import tgdsl
 from tgdsl.adapters.mjlab import TouchSensorCfg, observation, reading
 from tgdsl.errors import SimulationError, TgdslError
+from tgdsl.module.calls import Graphed
 
 HAND = """
 <body name="palm">
@@ -61,7 +63,7 @@ def make(sensor, terms, rewards=None) -> ManagerBasedRlEnv:
     return make_env(SceneCfg(num_envs=2, entities=entities(), sensors=(sensor,)), groups, rewards)
 
 
-def make_env(scene, observations, rewards=None) -> ManagerBasedRlEnv:
+def make_env(scene, observations, rewards=None, device="cpu") -> ManagerBasedRlEnv:
     cfg = ManagerBasedRlEnvCfg(
         decimation=DECIMATION,
         episode_length_s=10.0,
@@ -70,7 +72,7 @@ def make_env(scene, observations, rewards=None) -> ManagerBasedRlEnv:
         rewards=rewards or {},
         sim=SimulationCfg(nconmax=16, njmax=64, mujoco=MujocoCfg(timestep=0.002)),
     )
-    return ManagerBasedRlEnv(cfg, device="cpu")
+    return ManagerBasedRlEnv(cfg, device=device)
 
 
 TERMS = {
@@ -82,12 +84,12 @@ TERMS = {
 def push(env) -> None:
     """Move joints and cube differently in each environment."""
     rng = np.random.default_rng(0)
-    env.sim.data.qvel[:] = torch.from_numpy(rng.normal(size=env.sim.data.qvel.shape, scale=0.05)).float()
+    env.sim.data.qvel[:] = torch.from_numpy(rng.normal(size=env.sim.data.qvel.shape, scale=0.05)).to(env.sim.data.qvel)
     env.sim.data.qvel[:, env.sim.mj_model.joint("robot/bend").dofadr[0]] = 3.0
 
 
 def steps(env, num) -> torch.Tensor:
-    action = torch.zeros(env.num_envs, env.action_manager.total_action_dim)
+    action = torch.zeros(env.num_envs, env.action_manager.total_action_dim, device=env.device)
     for _ in range(num):
         obs = env.step(action)[0]
     return obs["actor"]
@@ -164,6 +166,43 @@ def test_a_reading_advances_once_per_control_step(tmp_path):
     _ = sensor.data
     assert len(calls) == 3 and calls[2].tolist() == [False, True]
     env.close()
+
+
+def readings_over_resets(doc, device, graph, capture=None) -> list[torch.Tensor]:
+    """Return observations and readings of steps, with resets of one environment before and after its reading."""
+    sensors = (TouchSensorCfg(name="touch", document=doc, graph=graph),)
+    groups = {"actor": ObservationGroupCfg(terms={name: ObservationTermCfg(**term) for name, term in TERMS.items()})}
+    env = make_env(SceneCfg(num_envs=2, entities=entities(), sensors=sensors), groups, device=device)
+    sensor, result = env.scene["touch"], []
+    if capture is not None:  # as on a GPU
+        sensor._is_graphed, sensor._graphed = True, Graphed(lambda *_: sensor._read_all(), capture)
+    env.reset()
+    push(env)
+    for i in range(8):
+        result.append(steps(env, 1).clone())
+        if i in (3, 5):
+            env.reset(env_ids=torch.tensor([1], device=device))
+            result.append(sensor.data["depth"].clone())
+    result += [sensor.observations["policy"].clone(), observation(env, "touch").clone()]
+    env.close()
+    return result
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_replays_equal_calls(tmp_path, device):
+    """With noise, delay and history."""
+    if device == "cuda" and not torch.cuda.is_available():
+        pytest.skip("there is no GPU")
+    noise = {"bias": 1e-3, "white_noise": 1e-3, "drift": 1e-4, "read_delay": "6 ms"}
+    noisy = {"kind": "contact_depth", "links": ["palm"], "feels": ["cube"], "history": 3, "noise": noise}
+    doc, recorder = document(tmp_path, depth=noisy), Recorder()
+    calls = readings_over_resets(doc, device, graph=False)
+    replays = readings_over_resets(doc, device, graph=True, capture=recorder if device == "cpu" else None)
+    assert recorder.count >= 1 or device == "cuda"
+    close = {"atol": 0.0, "rtol": 0.0} if device == "cpu" else {"atol": 1e-6, "rtol": 1e-5}  # compiled on a GPU
+    for call, replay in zip(calls, replays, strict=True):
+        torch.testing.assert_close(replay, call, **close)
+    assert not torch.equal(calls[0], calls[7])
 
 
 def test_resetting_one_environment_keeps_the_others(tmp_path):

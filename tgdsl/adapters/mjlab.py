@@ -20,6 +20,7 @@ from torch import Tensor
 
 from tgdsl.adapters import Document, module_of
 from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.module.calls import Graphed
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.runtime.read import read_warp
@@ -34,6 +35,7 @@ class TouchSensorCfg(SensorCfg):
     names: Mapping[str, str] = field(default_factory=dict)  # in mjlab's scene by those in the document, where they differ
     # returns the scene that the document is of, robot and objects under its names; default: what it names itself
     scene_fn: Callable[[], mujoco.MjSpec] | None = None
+    graph: bool = True  # on a GPU: compile the module, and replay it with the reading of the scene as one CUDA graph
 
     def build(self) -> TouchSensor:
         """Compile the document, or load the artefact."""
@@ -53,6 +55,8 @@ class TouchSensor(Sensor):
         super().__init__()
         self.touch, self._cfg, self._elapsed = touch, cfg, 0.0
         self._due: Bool[Tensor, " env"] | None = None  # environments to read; None: all
+        self._observed: dict[str, Tensor] | None = None  # observation groups of the readings, once they are known
+        self._graphed, self._dt, self._has_run = Graphed(lambda *_: self._read_all()), 0.0, False
 
     def edit_spec(self, scene_spec: mujoco.MjSpec, entities: Mapping[str, Any]) -> None:
         """Leave the scene as it is: contacts are read without sensors."""
@@ -63,6 +67,9 @@ class TouchSensor(Sensor):
         inputs = self.touch.inputs.renamed(self._cfg.names, prefix=self._cfg.prefix)
         self._scene = (mj_model, model.struct, data.struct, inputs)
         self._state()
+        self._is_graphed = self._cfg.graph and self.touch.device.type == "cuda"
+        if self._is_graphed:
+            self.touch.compile()
 
     def reset(self, env_ids: Tensor | slice | None = None) -> None:
         """Begin a new episode in some environments (default: all)."""
@@ -94,13 +101,40 @@ class TouchSensor(Sensor):
                     color = (0.9, 0.1, 0.1, 1.0) if is_active else (0.5, 0.5, 0.5, 0.5)
                     visualizer.add_sphere(pos[env, body] + arm, float(taxel["radius"]) / 2, color)
 
+    @property
+    def observations(self) -> dict[str, Float[Tensor, "env feature"]]:
+        """Observation groups of the document by name, of the readings in `data`."""
+        readings = self.data
+        self._observed = self._observed or self.touch.observe(readings)
+        return self._observed
+
     def _compute_data(self) -> dict[str, Tensor]:
-        state = self._state()
-        state.dt = self._elapsed or self.touch.inputs.dt or float(self._scene[0].opt.timestep)
+        num_envs = self._scene[2].nworld
+        dt = self._elapsed or self.touch.inputs.dt or float(self._scene[0].opt.timestep)
+        if dt != self._dt:
+            self._dt = dt
+            self._graphed.forget()
+        self._observed = None
         with torch.no_grad():
-            readings = self.touch(state, mask=self._due)
-        self._due = torch.zeros(self._scene[2].nworld, dtype=torch.bool, device=self.touch.device)
+            if self._due is None and self._is_graphed and self._has_run:
+                memory = self.touch.memory.tensors(num_envs, dt, self.touch.dtype, self.touch.device)
+                readings = self._graphed({}, memory)
+                self._observed = {name: readings.pop(f"observed/{name}") for name in self.touch.observations}
+                self.touch.record_outputs(readings)
+            else:
+                readings = self._read(self._due)
+        self._has_run, self._due = True, torch.zeros(num_envs, dtype=torch.bool, device=self.touch.device)
         return readings
+
+    def _read_all(self) -> dict[str, Tensor]:
+        readings = self._read()
+        groups = self.touch.observe(readings) if self.touch.observations else {}
+        return readings | {f"observed/{name}": value for name, value in groups.items()}
+
+    def _read(self, mask: Bool[Tensor, " env"] | None = None) -> dict[str, Tensor]:
+        state = self._state()
+        state.dt = self._dt
+        return self.touch(state, mask=mask)
 
     def _state(self) -> SceneState:
         mj_model, model, data, inputs = self._scene
@@ -120,4 +154,4 @@ def observation(env: Any, sensor: str, group: str = "policy") -> Float[Tensor, "
     touch = env.scene[sensor].touch
     if group not in touch.observations:
         raise TgdslError(f'the sensor "{sensor}" has no group "{group}"; {did_you_mean(group, touch.observations, "groups")}')
-    return touch.observe(env.scene[sensor].data)[group]
+    return env.scene[sensor].observations[group]
