@@ -166,5 +166,5 @@ def test_objects_share_no_compiled_code():
 def test_inductor_knows_the_options():
     from torch._inductor import config
 
-    for name in torch_internals.inductor_options(True, True, True):
+    for name in torch_internals.inductor_options(True, True, True, True):
         assert name in config.get_config_copy()

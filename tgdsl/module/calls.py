@@ -123,7 +123,9 @@ def inductor_options(plan: Plan, quantities: Sequence[Quantity], device: torch.d
         and all(target.num_pairs == 1 for target in plan.objects)
     )
     is_fused = device.type == "cpu" and bool(quantities) and all(quantity.is_fused for quantity in quantities)
-    return torch_internals.inductor_options(any(name in plan.inputs.fields for name in CHOICES), is_slight, is_fused)
+    checks_indices = any(name in plan.inputs.fields for name in CHOICES)
+    has_slots = any(name.startswith("contact_") for name in plan.inputs.fields)
+    return torch_internals.inductor_options(checks_indices, is_slight, has_slots, is_fused)
 
 
 def cpp_compiler() -> str | None:

@@ -143,20 +143,21 @@ def with_own_code(method: Callable[..., Any]) -> Callable[..., Any]:
     return MethodType(copy, method.__self__)
 
 
-def inductor_options(checks_indices: bool, has_tiles: bool, is_fused: bool) -> dict[str, Any]:
+def inductor_options(checks_indices: bool, has_tiles: bool, has_slots: bool, is_fused: bool) -> dict[str, Any]:
     """Return options for torch.compile, which are names of Inductor's private configuration.
 
     Kernels may assert that indices read from tensors are in range; on a GPU have tiles of 32 × 32 of two axes, not blocks of
-    one flat axis; and have as many operations as can be, instead of 64 at most.
+    one flat axis, for plans with or without slots of contacts; and have as many operations as can be, instead of 64 at most.
     """
-    # Sizes of blocks are chosen by timing, but of a kernel that takes 10 µs that is the time of its launch. Of a sum over slots
-    # it may choose one row a block, which takes 48 µs for 6, unless coordinate descent goes on from there. From Hopper on each
-    # kernel with tiles is launched while the one before it ends (programmatic dependent launch).
+    # Sizes of blocks are chosen by timing, but of a kernel that takes 10 µs that is the time of its launch. Without timing sums
+    # over slots have one row a block (47 µs for 5), from where coordinate descent goes on; of a depth alone it chooses worse
+    # tiles (14 to 31 µs for 11). From Hopper on each kernel with tiles is launched while the one before it ends (programmatic
+    # dependent launch).
     options: dict[str, Any] = {
         "assert_indirect_indexing": checks_indices,
         "triton.prefer_nd_tiling": has_tiles,
         "triton.autotune_pointwise": not has_tiles,
-        "coordinate_descent_tuning": has_tiles,
+        "coordinate_descent_tuning": has_tiles and has_slots,
         "triton.enable_pdl": has_tiles,
     }
     return options | {"max_fusion_size": 1024} if is_fused else options

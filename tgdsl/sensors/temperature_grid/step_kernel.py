@@ -29,7 +29,7 @@ PI = tl.constexpr(3.141592653589793)
 UNROLLED = tl.constexpr(8)  # modes up to which they are written out one by one
 MAX_PAIRS = 32  # pairs of a program, where boxes are small: one for each thread of a warp
 MAX_NUMBERS = 2048  # numbers of a program's block, unless one environment has more
-OF_WARP = 256  # numbers of a block for each warp. Between warps, sums go through shared memory.
+OF_WARP = 128  # numbers of a block for each warp. Between warps, sums go through shared memory.
 
 
 @triton_op("tgdsl::heat_step", mutates_args={})
