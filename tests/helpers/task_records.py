@@ -77,8 +77,9 @@ def instant(now: Now) -> Record:
         "angvel": own.angvel,
         "friction": now.friction,
         "mass": now.mass,
+        "last_action": now.past_actions[:, 0],
     }
-    names = ("joint_pos", "joint_vel", "target", "torque", "action", "last_action", "link_force", "normal_force", "distance")
+    names = ("joint_pos", "joint_vel", "target", "torque", "action", "link_force", "normal_force", "distance")
     found |= {name: getattr(now, name) for name in names}
     return {name: value.detach().double().cpu().numpy().copy() for name, value in found.items()}
 

@@ -120,6 +120,24 @@ def test_a_saved_environment_resumes_with_its_terms(folder):
     )
 
 
+def test_terms_read_the_last_actions(folder):
+    """The latest first, zero before an episode's first step, and saved with the environment."""
+    env, resumed = tiny_env(folder), tiny_env(folder)
+    actions = 2 * torch.rand((7, 4, 2), generator=torch.Generator().manual_seed(0)) - 1
+    exact = actions.double()
+    for i in range(5):
+        env.step(actions[i])
+    expected = exact[[3, 2, 1]].transpose(0, 1)
+    torch.testing.assert_close(env.now.past_actions, expected)
+    resumed.load_state_dict(env.state_dict())
+    resumed.step(actions[5])
+    torch.testing.assert_close(resumed.now.past_actions, exact[[4, 3, 2]].transpose(0, 1))
+    env.reset()
+    env.step(actions[5])
+    env.step(actions[6])
+    torch.testing.assert_close(env.now.past_actions, torch.stack([exact[5], *torch.zeros(2, 4, 2).double()], dim=1))
+
+
 def test_observations_compile_to_one_graph(folder):
     """Steps on a GPU are compiled: each graph break would launch its own kernels."""
     env = tiny_env(folder, more="terms: {object: {term: object_state}}\ngoal: [orientation, difference, angle]\n")

@@ -44,6 +44,7 @@ from tgdsl.tensors.torch_internals import below_autograd
 SINGLE_THREAD_MAX_TAXELS = 2**16
 """On a CPU one thread reads up to so many taxels of all environments: each of two would get fewer than 2¹⁵ numbers."""
 FAR_BEYOND = 10.0  # actions of that size are a mistake, such as angles in degrees
+NUM_PAST_ACTIONS = 3  # that reward terms may read
 PREPARING_STEPS = 3  # the third step is captured on a GPU, and the second one compiled
 
 
@@ -176,7 +177,8 @@ class TouchEnv:
         self.steps, self._return = torch.zeros_like(self.resets), torch.zeros_like(self.resets, dtype=torch.float32)
         self._sums = self._return[None][:0]  # of each term of the reward over the present episode, (term, env)
         self._action = torch.zeros((num_envs, self.num_actions), dtype=torch.float32, device=self.device)
-        self._used, self._before = torch.zeros_like(self.actuation.target), torch.zeros_like(self.actuation.target)
+        self._used = torch.zeros_like(self.actuation.target)
+        self._past = torch.zeros_like(self._used)[:, None].repeat(1, NUM_PAST_ACTIONS, 1)
         is_measured = self.spec.joint_vel == "measured"
         self._speeds = groups.MeasuredVelocity(self.actuation.target, setup.control_step) if is_measured else None
         self._restarted = FusedCall(self._restart, is_compiled)
@@ -341,7 +343,7 @@ class TouchEnv:
         episodes = {"number": self.resets, "steps": self.steps, "total": self._return}
         episodes |= {"friction": setup.friction, "mass": setup.mass} | {f"sums/{name}": value for name, value in sums}
         memory = {"episodes": episodes, "actuation": self.actuation.memory(), "task": self.task.memory}
-        memory["actions"] = {"used": self._used, "before": self._before}
+        memory["actions"] = {"used": self._used, "past": self._past}
         memory["speeds"] = self._speeds.memory if self._speeds else {}
         memory |= {"curricula": self.curricula.values, "events": self._events.memory}
         return {part: tensors for part, tensors in memory.items() if tensors or part == "task"}
@@ -355,8 +357,8 @@ class TouchEnv:
         self.sim.reset(chosen, contacts=start.contacts, **start.values)
         self._restarted(chosen, "ctrl" in start.values)
         self._events.reset(chosen, self.resets, is_placed=True)
-        for action in (self._used, self._before):
-            action.masked_fill_(chosen[:, None], 0.0)
+        self._used.masked_fill_(chosen[:, None], 0.0)
+        self._past.masked_fill_(chosen[:, None, None], 0.0)
 
     def _restart(self, chosen: Bool[Tensor, " env"], at_controls: bool) -> None:
         self.actuation.reset(chosen, self.resets, at_controls)
@@ -367,7 +369,7 @@ class TouchEnv:
         """Make one control step with the action that was copied, and return the instant at its end."""
         sim = self.sim
         with self._logic_by():
-            self._before.copy_(self._used)
+            self._past.copy_(torch.cat([self._used[:, None], self._past[:, :-1]], dim=1))
             control = self._commanded(self._action, sim.ctrl)
             self._events.advance()
         readings = self._step_physics(control)
@@ -464,7 +466,7 @@ class TouchEnv:
             target=self.actuation.target,
             torque=watched.joint_effort[:, :num] if self.actuation.is_ideal else self.actuation.torque,
             action=self._used,
-            last_action=self._before,
+            past_actions=self._past,
             link_force=force,
             normal_force=normal_force,
             distance=readings[distance].amin(dim=2).to(none) if distance else none,

@@ -124,7 +124,7 @@ class Now:
     target: Float[Tensor, "env joint"]  # position targets of their drives after the last action [rad]
     torque: Float[Tensor, "env joint"]  # torques of their drives [N·m]
     action: Float[Tensor, "env joint"]  # last action, from −1 to 1; zero at the start of an episode
-    last_action: Float[Tensor, "env joint"]  # action of the control step before
+    past_actions: Float[Tensor, "env past joint"]  # actions of the three control steps before, the latest first
     link_force: Float[Tensor, "env link 3"]
     """The object's force on each link, in the link's frame [N]; no links if the task takes no `link_contact`."""
     normal_force: Float[Tensor, "env loaded"]

@@ -201,7 +201,7 @@ class ActionRate(RewardTerm):
     """Change of the action, |a_t − a_{t−1}|²."""
 
     def rate(self, now: Now, setup: Setup) -> Float[Tensor, " env"]:
-        return (now.action - now.last_action).square().sum(dim=1)
+        return (now.action - now.past_actions[:, 0]).square().sum(dim=1)
 
 
 class JointLimit(RewardTerm):
