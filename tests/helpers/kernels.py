@@ -1,9 +1,15 @@
 """Triton kernels on the CPU, by Triton's interpreter."""
 
+import atexit
+import json
 import os
+import runpy
 import subprocess
 import sys
+import tempfile
+import traceback
 from functools import cache
+from typing import IO
 
 import pytest
 import torch.library
@@ -23,14 +29,58 @@ def interpreted(path: str, *arguments: str) -> str:
 
 
 def as_script(path: str, *arguments: str, **chosen: str) -> str:
-    """Run a test's module in a process without run-time checks of types, and return what it prints.
+    """Run a test's module in a process without run-time checks of types, and return its output.
 
     Those checks wrap functions, of which torch then cannot infer the schema of an operator.
     """
+    server = script_server(**chosen)
+    assert server.stdin and server.stdout
+    print(json.dumps([path, *arguments]), file=server.stdin, flush=True)
+    status, output, errors = json.loads(server.stdout.readline())
+    assert status == 0, errors[-4000:]
+    return output
+
+
+@cache
+def script_server(**chosen: str) -> subprocess.Popen[str]:
+    """Return a process that has imported torch and Triton, which takes 3 s, and forks to run each script."""
     chosen |= {"PYTHONWARNINGS": "ignore", "PYTHONPATH": os.pathsep.join(sys.path)}
-    run = subprocess.run([sys.executable, path, *arguments], env=os.environ | chosen, capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr[-4000:]
-    return run.stdout
+    command = [sys.executable, "-c", "import kernels; kernels.serve()"]
+    server = subprocess.Popen(command, env=os.environ | chosen, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    atexit.register(server.communicate)
+    return server
+
+
+def serve() -> None:
+    """Run a script for each line of the input, a path and its arguments as JSON; write status, output and errors."""
+    for line in sys.stdin:
+        with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as errors:
+            if (child := os.fork()) == 0:
+                os.dup2(output.fileno(), 1)
+                os.dup2(errors.fileno(), 2)
+                run_script(*json.loads(line))
+            status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+            print(json.dumps([status, *(read_all(file) for file in (output, errors))]), flush=True)
+
+
+def run_script(path: str, *arguments: str) -> None:
+    """Run a script and end the process, which is a fork of the server."""
+    sys.argv, status = [path, *arguments], 1
+    try:
+        runpy.run_path(path, run_name="__main__")
+        status = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+
+
+def read_all(file: IO[bytes]) -> str:
+    """Return the text of a file."""
+    file.seek(0)
+    return file.read().decode()
 
 
 def use_kernels() -> None:

@@ -1,8 +1,6 @@
 """The Triton kernel of the links' products, interpreted on the CPU, against products in float64."""
 
 import json
-import sys
-from functools import cache
 
 import pytest
 import torch
@@ -70,16 +68,16 @@ def edges() -> dict[str, list]:
     return {"not a number": are_equal, "no line": list(LINK_PRODUCTS(*inputs(0, [20, 99], 2)).shape)}
 
 
-@cache
-def results(function: str) -> dict:
-    """Return the result of a function of this file in a process that interprets kernels."""
-    return json.loads(interpreted(__file__, function))
+@pytest.fixture(scope="module")
+def results() -> dict:
+    """Return the results of a process that interprets kernels."""
+    return json.loads(interpreted(__file__))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
-def test_kernel_returns_the_product(name):
-    assert results("errors")[name] < 1
+def test_kernel_returns_the_product(results, name):
+    assert results[name] < 1
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -90,15 +88,15 @@ def test_torch_code_returns_the_product(name):
 
 
 @pytest.mark.slow
-def test_nans_stay_in_their_line_and_link():
-    assert results("edges")["not a number"] == [True, True]
+def test_nans_stay_in_their_line_and_link(results):
+    assert results["not a number"] == [True, True]
 
 
 @pytest.mark.slow
-def test_zero_lines_give_an_empty_product():
-    assert results("edges")["no line"] == [2, 0, 119]
+def test_zero_lines_give_an_empty_product(results):
+    assert results["no line"] == [2, 0, 119]
 
 
 if __name__ == "__main__":
     use_kernels()
-    print(json.dumps({"errors": errors, "edges": edges}[sys.argv[1]]()))
+    print(json.dumps(errors() | edges()))

@@ -231,9 +231,9 @@ KEPT = REPOSITORY / "policies" / "grip_force_agg_force.pt"
 
 @pytest.mark.slow
 def test_the_kept_student_scores_the_same_in_simulation_and_emulation():
-    """Four episodes of three seconds, each with another object; within the simulation's interval."""
+    """Four episodes of 1.5 s, each with another object; within the simulation's interval."""
     task, calibration = REPOSITORY / "examples/tasks/grip_force.yaml", REPOSITORY / "examples/tasks/grip_calibration.yaml"
-    options = {"episodes": 4, "overrides": {"episode": "3 s"}}
+    options = {"episodes": 4, "overrides": {"episode": "1.5 s"}}
     simulated = deploy(task, KEPT, **options).scores
     emulated = deploy(task, KEPT, "emulator", lockstep=True, calibration=calibration, **options).scores
     assert simulated.interval[0] < emulated.mean < simulated.interval[1]

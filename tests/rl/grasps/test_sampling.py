@@ -140,8 +140,8 @@ def test_objects_on_other_joints_are_held_while_the_hand_closes(tmp_path, joint)
 @pytest.mark.slow
 def test_grasps_of_the_screwdriver():
     """Every handle, by three fingertips in the middle of their joints' ranges; two handles in three hold at once."""
-    grasps = sample_grasps(REPOSITORY / "examples" / "tasks" / "screwdriver.yaml", num=128)
-    assert np.bincount(grasps.variant).tolist() == [32] * 4
+    grasps = sample_grasps(REPOSITORY / "examples" / "tasks" / "screwdriver.yaml", num=64)
+    assert np.bincount(grasps.variant).tolist() == [16] * 4
     lift, quat = grasps.qpos[:, 12], grasps.qpos[:, 13:]
     assert np.abs(lift).max() < 2.5e-3  # half the limit that ends an episode
     tilt = np.arccos(1 - 2 * (quat[:, 1] ** 2 + quat[:, 2] ** 2))

@@ -61,25 +61,26 @@ def test_policies_of_the_wheel_fit_their_tasks(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("file", POLICIES, ids=lambda file: file.stem)
 def test_a_policy_does_better_than_rest(file):
-    """Usually in each of four environments within two seconds on MuJoCo.
+    """Usually in each of four environments within a second on MuJoCo.
 
-    Students (eight environments) and reorientation (sixteen) may lose some objects: their sum counts, over five seconds.
-    The resting environments compute no touch, which does not change their episodes.
+    Students and reorientation may lose some objects: the sum of eight environments counts, over five seconds.
+    The resting environments compute no touch, which does not change their episodes. A few grasps suffice to begin.
     """
     saved = read_policy(file)
     card = saved.card
     is_long = "teacher" in card or card["score"]["task"] == "in_hand_repose"
-    num = (8 if "teacher" in card else 16) if is_long else 4
-    env = TouchEnv(REPOSITORY / card["task"], num, threads=1, overrides=card["overrides"])
+    num = 8 if is_long else 4
+    fewer = {"grasps.num": "16"} if card["score"]["task"] == "screwdriver" else {}
+    env = TouchEnv(REPOSITORY / card["task"], num, threads=1, overrides={**card["overrides"], **fewer})
     policy, obs = policy_for(env, saved), env.reset(seed=1)
-    assert set(policy.changes) <= {CAPPED}
+    assert all(change == CAPPED or change.startswith("grasps.num") for change in policy.changes)
     steps = env.max_steps - 1  # after an episode's last step the score is the next one's
-    steps = min(steps, round((5.0 if is_long else 2.0) / env.control_step))
+    steps = min(steps, round((5.0 if is_long else 1.0) / env.control_step))
     returns = torch.zeros(num)
     for _ in range(steps):
         step = env.step(policy(obs))
         obs, returns = step.obs, returns + step.reward.float()
-    rest = TouchEnv(REPOSITORY / card["task"], num, threads=1, overrides={**card["overrides"], "touch": "none"})
+    rest = TouchEnv(REPOSITORY / card["task"], num, threads=1, overrides={**card["overrides"], **fewer, "touch": "none"})
     rest.reset(seed=1)
     resting = sum(rest.step(torch.zeros(num, env.num_actions)).reward.float() for _ in range(steps))
     assert returns.sum() > resting.sum() if is_long else (returns > resting).all()

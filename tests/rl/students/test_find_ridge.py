@@ -33,7 +33,7 @@ def test_only_students_with_touch_reach_their_teacher(tmp_path):
     env = TouchEnv(loaded, 96, threads=1, feels=feels(keys, ridge_teacher.felt))
     try:
         distiller = Distiller(env, loaded, ridge_teacher.bound(env), keys, 0)
-        for _ in range(40):
+        for _ in range(25):
             distiller.iterate()
         evaluations = evaluate_each(env, distiller.acting(), len(keys), EPISODES)
     finally:

@@ -103,7 +103,7 @@ def test_rewards_ends_and_scores_equal_the_reference():
 def test_the_unchanged_document_equals_the_reference():
     env = TouchEnv(DOCUMENT, NUM, threads=1)
     recorder = Recorder(env, lambda now: command(env))
-    for action in random_actions(env, 150):
+    for action in random_actions(env, 80):
         recorder.step(action)
     assert {"force_near", "force_far", "object_angle", "action_rate", "work"} <= assert_reference(recorder, reference_of)
     env.close()
@@ -333,9 +333,9 @@ def test_mismatched_starts_and_times_are_refused(env, changes, says):
 
 
 @pytest.mark.slow
-def test_every_object_is_held_for_ten_seconds_without_actions():
+def test_every_object_is_held_for_five_seconds_without_actions():
     """For all masses, frictions and commands: the force is within 15 % and 0.4 N, the object sinks at most 1 cm."""
-    env = grip(2 * NUM, change=["20 s", "20 s"])
+    env = grip(2 * NUM, change=["20 s", "20 s"], episode="5 s")
     commands, forces = env.task.command.clone(), []
     start = env.task.start_pos.clone()
     for i in range(env.max_steps):
@@ -354,9 +354,9 @@ def test_the_whole_range_of_commands_can_be_pressed():
     """A closed loop reaches 1 to 8 N with every object within 5 %, using 40 % of the drives' torque."""
     env = grip(change=["20 s", "20 s"], randomise__mass=["0 g", "0 g"])
     limit = torch.from_numpy(env.task.setup.actuators.limit)
-    for target in (1.0, 2.0, 4.0, 8.0):
+    for target in (1.0, 3.0, 8.0):
         env.reset(0)
-        *_, result = regulated_steps(env, torch.full((NUM,), target).double(), 160)
+        *_, result = regulated_steps(env, torch.full((NUM,), target).double(), 80)
         assert not result.terminated.any()
         assert ((force_of(result) / target - 1).abs() < 0.05).all()
         assert (env.now.torque.abs() / limit).max() < 0.4

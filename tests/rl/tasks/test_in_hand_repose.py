@@ -386,6 +386,6 @@ def test_each_hand_holds_all_objects_without_actions(document, joints):
     quiet = {"touch": "none", "goal_timeout": "1000 s", "randomise.push": {"x": 0}}
     env = TouchEnv(document, 16, threads=1, overrides=quiet)
     assert env.num_actions == joints and env.task.setup.num_variants == 16
-    for _ in range(round(10 / env.control_step)):
+    for _ in range(round(4 / env.control_step)):
         result = rest(env)
         assert not result.terminated.any(), f"{result.terminated.nonzero().flatten().tolist()} were lost"

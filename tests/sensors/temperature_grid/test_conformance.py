@@ -107,13 +107,15 @@ class TestPerEnvironment(TestTemperatureGrid):
     test_compiled_equals_eager = KindConformance.test_compiled_equals_eager
     objects = HEAT | {
         "item": {"body": "item", "material": ["aluminium", "wood", "steel"], "temperature": {"per_env": 45.0}},
-        "tool": {**HEAT["tool"], "cells": [2, 3, 4]},
-        "floor": {"body": "floor", "material": "wood", "temperature": {"per_env": 10.0}},
+        "tool": {**HEAT["tool"], "cells": [1, 2, 1], "temperature": {"per_env": 10.0}},
     }
     parameters = {
         "cells": [2, 2, 2], "material": "copper", "emissivity": "material", "contact_area": "2 cm2", "contact_conductance": 500.0,
         "source": {"power": 2.0}, "lag": 0.3,
     }  # fmt: skip
+
+    def sensor(self):
+        return {**super().sensor(), "feels": ["item", "tool"]}
 
     def test_temperatures_come_from_the_state(self, scene):
         module, _ = self.build(self.document(scene), torch.float64)
