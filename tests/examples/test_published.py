@@ -8,6 +8,7 @@ import pytest
 
 from tgdsl.commands.distill import Distill
 from tgdsl.commands.train import Train
+from tgdsl.schema.yaml import parse
 
 FOLDER = Path(__file__).parents[2] / "examples" / "tasks" / "published"
 pytestmark = [pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning"), pytest.mark.usefixtures("no_onnx")]
@@ -16,6 +17,15 @@ FEW = {"in_palm_rotate": (), "in_hand_repose": (), "screwdriver": ("grasps.num=8
 
 def test_each_document_is_tested():
     assert {file.stem for file in FOLDER.glob("*.yaml")} == FEW.keys()
+
+
+def test_sensors_of_tasks_have_the_papers_radius_and_no_hysteresis():
+    documents = {file.name: parse(file.read_text(), file.name).value for file in FOLDER.parent.glob("*.yaml")}
+    sensors = [sensor for document in documents.values() for sensor in document.get("sensors", {}).values()]
+    near = [sensor["radius"] for sensor in sensors if sensor["kind"] == "proximity"]
+    contacts = [sensor for sensor in sensors if sensor["kind"] == "contact"]
+    assert len(near) >= 6 and set(near) == {"10 mm"}
+    assert contacts and not any("release_threshold" in sensor for sensor in contacts)
 
 
 @pytest.mark.slow
