@@ -110,6 +110,7 @@ class FindRidge(Task[FindRidgeSpec]):
     Spec = FindRidgeSpec
     senses = ("link_contact",)
     score_unit = "found"
+    score_range = (0, 1)
     own_groups = ("command", "priv_ridge")
     hand_groups = ("command",)
 

@@ -18,6 +18,7 @@ probes of the `surface_distance` sensor, `nq` and `nu` as in MuJoCo's model.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
@@ -232,6 +233,8 @@ class Task(ABC, Generic[S]):
     wants_normal_force: ClassVar[bool] = False
     score_unit: ClassVar[str]  #: unit of its score
     is_less_better: ClassVar[bool] = False  #: whether its score is an error
+    #: least and largest possible score: confidence intervals end there
+    score_range: ClassVar[tuple[float, float]] = (-math.inf, math.inf)
     #: names of the groups of `observe`, checked when a document is loaded; None: known only in environments
     own_groups: ClassVar[tuple[str, ...] | None] = None
     #: groups that `observe_hand` computes without a scene: a policy on a hand sees no others of the task

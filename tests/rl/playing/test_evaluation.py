@@ -10,8 +10,9 @@ from scipy import stats
 from small_tasks import small_task
 
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.playing.evaluation import evaluate, mean_interval, share_interval
+from tgdsl.rl.playing.evaluation import evaluate, mean_interval, score_interval, share_interval
 from tgdsl.rl.playing.rollout import ZeroActor
+from tgdsl.rl.task import Task
 
 
 @pytest.fixture(scope="module")
@@ -75,3 +76,23 @@ def test_intervals_match_known_values():
     assert mean_interval(1.0, 1.0, 1) == (-math.inf, math.inf)
     assert share_interval(0.8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
     assert share_interval(1.0, 1000)[1] == 1.0 and share_interval(0.0, 1000)[0] == pytest.approx(0.0, abs=1e-15)
+
+
+class ShareTask(Task):
+    score_range = (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("task", "scores", "interval"),
+    [
+        (Task, [1.0] * 7 + [0.0], (0.579, 1.171)),
+        (ShareTask, [1.0] * 7 + [0.0], (0.529, 0.978)),
+        (ShareTask, [1.0] * 6 + [0.5, 0.0], (0.501, 1.0)),
+        (ShareTask, [1.0], (-math.inf, math.inf)),
+    ],
+    ids=["any number", "0 or 1", "from 0 to 1", "one episode"],
+)
+def test_intervals_of_scores_stay_within_their_range(task, scores, interval):
+    values = np.array(scores)
+    found = score_interval(task, values.mean(), (values**2).sum(), len(values))
+    assert found == pytest.approx(interval, abs=1e-3)

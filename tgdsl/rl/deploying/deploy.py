@@ -22,7 +22,7 @@ from tgdsl.console.progress import Progress
 from tgdsl.console.tables import text_table
 from tgdsl.rl.deploying.hand import EVERYONE, DeployError, Hand, TaskScene, empty_step, prepare
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.playing.evaluation import SEED, mean_interval, share_interval
+from tgdsl.rl.playing.evaluation import SEED, score_interval, share_interval
 from tgdsl.rl.playing.policy import Policy
 from tgdsl.rl.playing.record import Record
 from tgdsl.rl.playing.rollout import Moment, rollout
@@ -255,7 +255,7 @@ class Deployment:
         if self.has_scene and num:
             each, are_held = zip(*self._episodes, strict=True)
             mean, held = math.fsum(each) / num, sum(are_held) / num
-            interval = mean_interval(mean, math.fsum(score**2 for score in each), num)
+            interval = score_interval(prepared.loaded.task, mean, math.fsum(score**2 for score in each), num)
             scores = Scores(each, mean, interval, held, share_interval(held, num))
         return Report(
             source=self.source,

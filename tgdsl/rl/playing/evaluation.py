@@ -21,6 +21,7 @@ from tgdsl.fields.units import parse
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.gait import METRICS, SHARE, UNITS, Gait, GaitMeter
 from tgdsl.rl.playing.rollout import Actor, rollout
+from tgdsl.rl.task import Task
 
 SEED = 1_000_003  # seed of the episodes, independent of a policy's training
 Z95 = 1.959963984540054
@@ -33,7 +34,7 @@ _PART = re.compile(r"\s*(?P<name>[^\s<>=]+)\s*(?P<sign><=|>=|<|>)\s*(?P<value>[^
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Means over some episodes of a policy, with 95 % intervals: Student's, and Wilson's of `held`.
+    """Means over some episodes of a policy, with 95 % intervals: Wilson's of shares, Student's of others.
 
     `held` is the share of episodes of full length, without a drop or another end; `seconds` is their duration [s], `faults` the
     number of episodes that a fault ended.
@@ -118,7 +119,7 @@ def evaluate_each(
             envs=min(size, episodes),
             seed=seed,
             score=scores / episodes,
-            score_interval=mean_interval(scores / episodes, squares, episodes),
+            score_interval=score_interval(type(env.task), scores / episodes, squares, episodes),
             held=whole / episodes,
             held_interval=share_interval(whole / episodes, episodes),
             episode_return=returns / episodes,
@@ -167,6 +168,18 @@ def parse_requirements(text: str) -> list[Requirement]:
             raise TgdslError(f'--require "{part}": {error}') from error
         requirements.append(Requirement(part, name, match["sign"], 0.01 * bound if is_percent else bound))
     return requirements
+
+
+def score_interval(task: type[Task[Any]], mean: float, squares: float, num: int) -> tuple[float, float]:
+    """Return the 95 % interval of a task's mean score, within the range of its scores.
+
+    It is Wilson's if all scores are 0 or 1, else Student's.
+    """
+    least, largest = task.score_range
+    if num > 1 and (least, largest) == (0, 1) and math.isclose(squares, num * mean, abs_tol=1e-9):
+        return share_interval(mean, num)
+    low, high = mean_interval(mean, squares, num)
+    return (max(low, least), min(high, largest)) if num > 1 else (low, high)
 
 
 def mean_interval(mean: float, squares: float, num: int) -> tuple[float, float]:

@@ -88,6 +88,7 @@ class GripForce(terms.HandTask[GripForceSpec]):
     senses = ("link_contact", "surface_distance")
     wants_normal_force = True
     score_unit = "RMS of force error over command"
+    score_range = (0, math.inf)
     own_groups = ("goal", "priv_force", "priv_obj_state", "priv_obj_props")
     is_less_better = True
     constants = ("settling",)

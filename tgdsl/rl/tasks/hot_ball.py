@@ -25,6 +25,7 @@ would apply to the hot ball alone and identify it: they are refused.
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 import numpy as np
@@ -87,6 +88,7 @@ class HotBall(terms.HandTask[HotBallSpec]):
     Spec = HotBallSpec
     senses = ("temperature_grid", "link_contact", "surface_distance")
     score_unit = "s of latched contact"
+    score_range = (0, math.inf)
     own_groups = ("priv_heat", "priv_obj_state", "priv_obj_props")
 
     @reward_term(1.0, "1/s")

@@ -105,6 +105,7 @@ class InHandRepose(terms.HandTask[InHandReposeSpec]):
     senses = ("link_contact", "surface_distance")
     constants = ("goal_step",)
     score_unit = "goals in a row"
+    score_range = (0, math.inf)
     own_groups = ("goal", "priv_obj_state", "priv_obj_props")
 
     @reward_term(500.0, "1/s")
