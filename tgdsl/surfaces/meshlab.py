@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from tgdsl.surfaces.rays import sphere_directions
 from tgdsl.surfaces.region import LENGTH_TOLERANCE
 from tgdsl.surfaces.surface import Surface, winding_number
 
@@ -30,6 +31,10 @@ sphere with a hole of an eighth of its radius is solid, a bowl is not."""
 
 ROUNDING = 0.05
 """Fast winding numbers (Barill et al., SIGGRAPH 2018) that are this close to an integer are not computed exactly."""
+
+
+SLABS = sphere_directions(32)
+"""Directions across slabs that bound a component: points outside any of them are outside, without a winding number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +54,8 @@ class Shell:
     def is_closed(self) -> Bool[np.ndarray, " component"]:
         """Which solid components have no border: faces pass every edge as often one way as the other."""
         edges = _edges(self.surface.faces)
-        low, high = edges.min(axis=1), edges.max(axis=1)
-        _, edge = np.unique(low * len(self.surface.vertices) + high, return_inverse=True)
-        sense = np.bincount(edge, np.where(edges[:, 0] == low, 1.0, -1.0))[edge]
+        _, edge = np.unique(_keys(edges), return_inverse=True)
+        sense = np.bincount(edge, np.where(edges[:, 0] < edges[:, 1], 1.0, -1.0))[edge]
         return self.is_solid & (np.bincount(np.repeat(self.component, 3), sense != 0) == 0)
 
     def solid(self, component: int) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
@@ -66,6 +70,9 @@ class Shell:
         winding = np.zeros(len(pos))
         vertices, faces = self.solid(component)
         near = ((pos >= vertices.min(axis=0) - self.offset) & (pos <= vertices.max(axis=0) + self.offset)).all(axis=1)
+        extent, height = vertices @ SLABS.T, pos[near] @ SLABS.T
+        low, high = extent.min(axis=0) - self.offset, extent.max(axis=0) + self.offset
+        near[near] = ((height >= low) & (height <= high)).all(axis=1)
         if near.any():
             winding[near] = np.atleast_1d(igl.fast_winding_number(vertices, faces, np.ascontiguousarray(pos[near])))
         doubtful = np.flatnonzero(np.abs(winding - np.round(winding)) > ROUNDING)
@@ -146,11 +153,16 @@ def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "edge 2"]:
     return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
 
 
+def _keys(edges: Int[np.ndarray, "edge 2"]) -> Int[np.ndarray, " edge"]:
+    """Return a number for each edge, the same in both senses; sorting numbers is faster than sorting pairs."""
+    return np.minimum(edges[:, 0], edges[:, 1]) * (edges.max(initial=0) + 1) + np.maximum(edges[:, 0], edges[:, 1])
+
+
 def _disagrees(faces: Int[np.ndarray, "f 3"]) -> bool:
     """Return whether two neighbours run along their common edge in the same sense."""
     edges = _edges(faces.astype(np.int64))
-    _, edge, num_faces = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
-    sense = np.bincount(edge.ravel(), np.where(edges[:, 0] < edges[:, 1], 1, -1))
+    _, edge, num_faces = np.unique(_keys(edges), return_inverse=True, return_counts=True)
+    sense = np.bincount(edge, np.where(edges[:, 0] < edges[:, 1], 1, -1))
     return bool(((num_faces == 2) & (sense != 0)).any())
 
 
@@ -166,8 +178,8 @@ def _components(surface: Surface) -> Int[np.ndarray, " f"]:
 
 def _solid(surface: Surface, component: Int[np.ndarray, " f"]) -> Bool[np.ndarray, " component"]:
     """Return whether each component is closed, except for small holes."""
-    edges = np.sort(_edges(surface.faces), axis=1)
-    _, first, num_faces = np.unique(edges, axis=0, return_index=True, return_counts=True)
+    edges = _edges(surface.faces)
+    _, first, num_faces = np.unique(_keys(edges), return_index=True, return_counts=True)
     border = first[num_faces == 1]
     length = np.linalg.norm(np.diff(surface.vertices[edges[border]], axis=1)[:, 0], axis=1)
     num = component.max(initial=-1) + 1
