@@ -314,9 +314,9 @@ def test_a_task_without_sensors_can_be_evaluated(tmp_path):
     """A task needs sensors only if it declares them; a policy may feel nothing. Joints and an object remain."""
     task = write_task(tmp_path)
     (tmp_path / "blind.py").write_text(
-        "from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\n\n\n"
+        "from tgdsl.rl.task import Task\nfrom tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\n\n\n"
         "class Blind(InPalmRotate):\n"
-        "    senses = ()\n\n"
+        "    senses = Task.senses  # of a task that does not name any\n\n"
         "    def reward(self, now, is_over):\n"
         "        return {'spin': self.rate}\n"
     )
