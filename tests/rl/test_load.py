@@ -321,6 +321,8 @@ def test_a_task_without_sensors_can_be_evaluated(tmp_path):
         "        return {'spin': self.rate}\n"
     )
     task.write_text(task.read_text().replace("in_palm_rotate", "blind.py:Blind"))
+    sensors = tmp_path / "sensors.yaml"
+    sensors.write_text("\n".join(line for line in sensors.read_text().splitlines() if "link_contact" not in line))
     env = TouchEnv(task, 2, overrides={"touch": "none"})
     assert env.reset()["proprio"].shape[0] == 2 and "tactile_sensors" not in env.groups
     evaluation = evaluate(env, ZeroActor(env), 2)
