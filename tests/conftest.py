@@ -14,6 +14,13 @@ import pytest
 MADE_UP_POSES = ("tests/sensors/", "tests/quantities/", "tests/module/", "tests/runtime/")
 """Folders whose tests make up poses, and so have taxels that no object would reach in a simulator."""
 
+LONGEST = (
+    "test_all_kinds_in_one_graph",
+    "test_every_kind_is_exported",
+    "test_a_robot_of_the_wheel_compiles_and_runs",
+    "test_a_compiled_package_computes_the_same_in_python_and_cpp",
+)
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add `--check-types`."""
@@ -61,15 +68,15 @@ def no_onnx(monkeypatch):
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the suite that kinds inherit, which has no marks: other people's pytest would not know them.
 
-    Seven environments suffice here, where each kind has other tests too. The longest test begins first, so that no
-    process waits for it at the end. Warp compiles a CPU's kernels without optimisation, in half the time.
+    Seven environments suffice here, where each kind has other tests too. The longest tests begin first, so that no
+    process waits for one at the end. Warp compiles a CPU's kernels without optimisation, in half the time.
     """
     if (torch := sys.modules.get("torch")) and not torch.cuda.is_available():
         with contextlib.suppress(ImportError):
             import warp
 
             warp.config.optimization_level = 0
-    items.sort(key=lambda item: item.name != "test_all_kinds_in_one_graph")
+    items.sort(key=lambda item: getattr(item, "originalname", "") not in LONGEST)
     if suite := sys.modules.get("tgdsl.testing.conformance"):
         suite.KindConformance.num_envs = 7
     for item in items:
