@@ -9,6 +9,7 @@ import torch
 import tgdsl
 from tgdsl.observations.observations import ObservationSpec
 from tgdsl.runtime.rollout import rollout, scripted_controls
+from tgdsl.schema.load import load
 from tgdsl.view.picture import picture
 from tgdsl.view.table import table
 
@@ -38,8 +39,8 @@ def readings(touch):
     return {name: torch.stack([step[name] for step in steps]) for name in steps[0]}
 
 
-def test_the_example_has_every_observation_type_of_the_paper(touch):
-    types = {term.type for term in touch.plan.observations}
+def test_the_example_has_every_observation_type_of_the_paper():
+    types = {part.type for parts in load(EXAMPLE).spec.observations.values() for part in parts}
     all_types = {part.model_fields["type"].annotation.__args__[0] for part in ObservationSpec.__origin__.__args__}
     hand_types = {"taxel_counts", "taxel_saturated", "joint_pos", "joint_vel", "joint_effort", "last_action"}
     assert types == all_types - {"none", "link_bool", "link_force", "reading", "cop"} - hand_types
