@@ -224,9 +224,11 @@ def test_runs_are_repeatable_and_written(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings(TORCHSCRIPT)
-def test_a_minute_of_learning_with_touch_is_far_above_chance(tmp_path):
-    """50 updates are a quarter of a million control steps; measured success was at least 0.9."""
-    result = run("touch", 50, tmp_path)
+def test_half_a_minute_of_learning_with_touch_is_far_above_chance(tmp_path, monkeypatch):
+    """30 updates are 150,000 control steps; measured success was 0.92."""
+    monkeypatch.setattr(learn, "evaluate", partial(learn.evaluate, num=200))
+    result = run("touch", 30, tmp_path)
+    assert result.success > 0.6 > 5.0 * result.chance
     assert result.success > 0.6 > 5.0 * result.chance
 
 
