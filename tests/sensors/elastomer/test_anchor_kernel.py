@@ -156,7 +156,7 @@ def test_the_kernel_matches_the_torch_code():
 
 def test_a_distance_is_less_than_a_cell_below_the_next_nodes():
     """The kernel skips points by this bound: half a cell's diagonal is 0.87 cells, the rest allows for interpolation."""
-    sensor = {"kind": "elastomer", "links": "hand", "feels": ["cube"], "anchors": "points", "points": 50}
+    sensor = {"kind": "elastomer", "links": "tips", "feels": ["cube"], "anchors": "points", "points": 50}
     touch = tgdsl.compile(PALM, resolution="low", overrides={"sensors": json.dumps({"s": sensor}), "observations": "{}"})
     (shape,), below = touch.plan.quantities["points"].surfaces.shapes, []
     random = torch.Generator().manual_seed(0)
