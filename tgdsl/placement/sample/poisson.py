@@ -209,7 +209,7 @@ def _dart_throwing(pos: Float[np.ndarray, "pool 3"], spacings: tuple[float, ...]
         for point in np.flatnonzero(gap >= spacing).tolist():
             if gap[point] >= spacing and len(taken) < count:
                 taken.append(point)
-                near = tree.query_ball_point(pos[point], spacings[0])
+                near = np.array(tree.query_ball_point(pos[point], spacings[0]), dtype=np.int64)
                 gap[near] = np.minimum(gap[near], np.linalg.norm(pos[near] - pos[point], axis=1))
         if len(taken) == count:
             break
