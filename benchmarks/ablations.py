@@ -34,7 +34,7 @@ def read(given: argparse.Namespace) -> None:
     from tgdsl.console.tables import text_table
     from tgdsl.files.write import check_writable
     from tgdsl.rl.load import load_task
-    from tgdsl.rl.sensed import num_variants
+    from tgdsl.rl.sensors import num_variants
 
     check_writable(given.out)
     loaded = load_task(given.task)

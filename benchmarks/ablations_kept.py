@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tgdsl.errors import TgdslError
-from tgdsl.rl.sensed import Felt
+from tgdsl.rl.sensors import PolicyTouch
 from tgdsl.rl.students.keys import NONE, StudentKey
 from tgdsl.rl.students.results import Row
 
@@ -145,8 +145,8 @@ def taught_in(rows: Sequence[Mapping[str, str]], resolutions: Sequence[str], fil
             raise KeptError(f"{file}: {error}") from error
         if own.resolution not in resolutions:
             raise KeptError(f'{file}: a row of the resolution "{own.resolution}", expected {", ".join(resolutions)}')
-        felt = None if own.type == NONE else Felt(own.type, own.placement, own.noise)
-        found.append(Taught(own, tuple(StudentKey(felt, seed).name for seed in range(own.seeds))))
+        touch = None if own.type == NONE else PolicyTouch(own.type, own.placement, own.noise)
+        found.append(Taught(own, tuple(StudentKey(touch, seed).name for seed in range(own.seeds))))
     return tuple(found)
 
 

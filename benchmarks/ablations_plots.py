@@ -23,15 +23,15 @@ COLOURS = {name: colormaps["tab10"](i % 10) for i, name in enumerate(touch_types
 
 def plot(ablation: Ablation) -> Figure:
     """Return the plot of an ablation; a panel shows at most ten types, the best."""
-    felt = [each for each in ablation.taught if each.row.type != NONE]
+    touch = [each for each in ablation.taught if each.row.type != NONE]
     blind = [each for each in ablation.taught if each.row.type == NONE]
-    places = list(dict.fromkeys(each.where for each in felt)) or [each.where for each in blind]
+    places = list(dict.fromkeys(each.where for each in touch)) or [each.where for each in blind]
     columns = min(MOST_COLUMNS, math.ceil(math.sqrt(len(places))))
     rows = math.ceil(len(places) / columns)
     figure = Figure(figsize=(1.5 + 4.2 * columns, 3.4 * rows), dpi=100, layout="constrained")
     panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
     for axes, where in zip(panels, places, strict=False):
-        own = [each for each in felt if each.where == where]
+        own = [each for each in touch if each.where == where]
         panel(axes, ablation, own + [each for each in blind if each.row.resolution == where[1]], where)
     for axes in panels[len(places) :]:
         axes.set_axis_off()

@@ -37,7 +37,7 @@ from tgdsl.files.write import atomic_write, with_folder
 from tgdsl.observations.observations import PerLink
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
-from tgdsl.rl.sensed import Felt, num_variants, types_of
+from tgdsl.rl.sensors import PolicyTouch, num_variants, types_of
 from tgdsl.rl.students.keys import NONE, Teacher
 
 FORCE = "priv_force"
@@ -125,15 +125,15 @@ def record(
     variants = num_variants(loaded)
     if envs < 2 * variants or envs % variants:
         raise TgdslError(f"{envs} environments, expected a multiple of {variants}, the variants of the object, and two of them")
-    felt = {type_: Felt(type_, placement, "clean").group for type_ in types} | {NONE: BLIND}
+    touch = {type_: PolicyTouch(type_, placement, "clean").group for type_ in types} | {NONE: BLIND}
     own = Teacher(teacher, loaded)
-    env = TouchEnv(loaded, envs, seed=seed, feels=[Felt(type_, placement, "clean") for type_ in types])
+    env = TouchEnv(loaded, envs, seed=seed, touches=[PolicyTouch(type_, placement, "clean") for type_ in types])
     try:
         if FORCE not in env.groups:
             raise TgdslError(
                 f'the task "{loaded.spec.task}" has no group "{FORCE}", expected one that tells the force on its object'
             )
-        channels = {type_: _channels(env, felt[type_]) for type_ in types} | {NONE: env.groups[BLIND] // env.num_actions}
+        channels = {type_: _channels(env, touch[type_]) for type_ in types} | {NONE: env.groups[BLIND] // env.num_actions}
         actor, obs, kept = own.bound(env), env.reset(seed), []
         least = 0.5 * loaded.spec.force[0]  # pyright: ignore[reportAttributeAccessIssue]
         number, first = torch.zeros(envs, dtype=torch.int64), round(SETTLING / env.control_step)
@@ -142,7 +142,7 @@ def record(
             chosen = (force >= least) & (env.steps >= first)
             if t % EVERY == 0 and bool(chosen.any()):
                 rows = torch.arange(envs)[chosen]
-                kept.append(({name: obs[group][chosen] for name, group in felt.items()}, force[chosen], number[chosen], rows))
+                kept.append(({name: obs[group][chosen] for name, group in touch.items()}, force[chosen], number[chosen], rows))
             step = env.step(actor(obs))
             obs = step.obs
             actor.begin(step.info.ended)
@@ -151,7 +151,7 @@ def record(
         env.close()
     if not kept:
         raise TgdslError(f"the object was never pressed with {least:g} N")
-    x = {name: torch.cat([each[0][name] for each in kept]).double().numpy() for name in felt}
+    x = {name: torch.cat([each[0][name] for each in kept]).double().numpy() for name in touch}
     force, number, rows = (torch.cat([each[i] for each in kept]).numpy() for i in (1, 2, 3))
     return Recorded(x, channels, force.astype(np.float64), number * envs + rows, rows)
 
@@ -223,7 +223,7 @@ def _told(sums: Array) -> tuple[Array, Array, Array]:
 
 def _channels(env: TouchEnv, group: str) -> int:
     """Return how many numbers a type has of each taxel, or of each link."""
-    source = env.felt[group]
+    source = env.touch_sources[group]
     return env.groups[group] // (len(source.layout.links) if isinstance(source.spec, PerLink) else source.layout.num_taxels)
 
 

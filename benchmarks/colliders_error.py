@@ -26,7 +26,7 @@ import mujoco
 import numpy as np
 
 from tgdsl.rl.load import load_task
-from tgdsl.rl.sensed import compile_sensed
+from tgdsl.rl.sensors import compile_sensors
 from tgdsl.scene.scene import Choice, SceneModels
 
 COLLISIONS, CONES = ("mesh", "primitive"), ("pyramidal", "elliptic")
@@ -58,9 +58,9 @@ class Scenes:
         self.scenes, self.names = {}, {}
         for collision in COLLISIONS:
             loaded = load_task(task, {"physics.collision": collision, "touch": "none"})
-            sensed = compile_sensed(loaded, "cpu")
-            self.scenes[collision], self.spec = sensed.touch.plan.scene, loaded.spec
-            self.body = sensed.object
+            sensors = compile_sensors(loaded, "cpu")
+            self.scenes[collision], self.spec = sensors.touch.plan.scene, loaded.spec
+            self.body = sensors.object
         self._models: dict[tuple[Any, ...], mujoco.MjModel] = {}
 
     def model(self, variant: Variant, number: int) -> mujoco.MjModel:

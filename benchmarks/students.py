@@ -39,8 +39,8 @@ from tgdsl.errors import TgdslError
 from tgdsl.files.write import atomic_write, check_writable, with_folder
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask, load_task
-from tgdsl.rl.sensed import num_variants
-from tgdsl.rl.students.keys import StudentKey, Teacher, check_blocks, feels, student_keys
+from tgdsl.rl.sensors import num_variants
+from tgdsl.rl.students.keys import StudentKey, Teacher, check_blocks, student_keys, touches
 from tgdsl.rl.students.learner import Distiller
 
 ROOT = Path(__file__).parents[1]
@@ -90,9 +90,9 @@ def profile(given: argparse.Namespace) -> dict[str, Any]:
 
 def simulated(given: argparse.Namespace, loaded: LoadedTask, teacher: Teacher, parts: Parts) -> dict[str, dict[str, Any]]:
     """Measure the parts of one simulation, which feels what any of them does."""
-    start, felt = time.perf_counter(), feels([key for keys in parts.values() for key in keys], teacher.felt)
+    start, touch = time.perf_counter(), touches([key for keys in parts.values() for key in keys], teacher.touch)
     with StatusLine() as progress:
-        env = TouchEnv(loaded, given.envs, device=given.device, feels=felt, progress=progress)
+        env = TouchEnv(loaded, given.envs, device=given.device, touches=touch, progress=progress)
     print(f"environments for {', '.join(parts)}: {time.perf_counter() - start:.0f} s", flush=True)
     try:
         found = {}

@@ -3,7 +3,7 @@
 import csv
 import json
 
-from tgdsl.rl.sensed import Felt
+from tgdsl.rl.sensors import PolicyTouch
 from tgdsl.rl.students.keys import NONE, StudentKey
 from tgdsl.rl.students.results import Row, write_table
 
@@ -33,12 +33,12 @@ def made_up_run(
     rows = []
     for resolution in resolutions:
         kinds = [
-            (type_, None if type_ == NONE else Felt(type_, place[0], place[2]))
+            (type_, None if type_ == NONE else PolicyTouch(type_, place[0], place[2]))
             for type_ in scores
             for place in ([("", resolution, "")] if type_ == NONE else places)
             if place[1] == resolution
         ]
-        keys = [(type_, StudentKey(felt, seed)) for type_, felt in kinds for seed in range(seeds)]
+        keys = [(type_, StudentKey(touch, seed)) for type_, touch in kinds for seed in range(seeds)]
         (folder / resolution).mkdir(parents=True)
         _curve(folder / resolution / "curve.csv", scores, keys, is_stale)
         own = {key.name: _evaluation(task, scores[type_](1.0) + 0.01 * key.seed) for type_, key in keys}
@@ -48,9 +48,9 @@ def made_up_run(
         start["spec"] = {"task": task, "episode": 10.0, "physics": physics, "distill": {"steps": STEPS, "learning_rate": 1e-4}}
         starts = [start | {"iteration": first} for first in LEGS]
         (folder / resolution / "run.json").write_text(json.dumps({"starts": starts}))
-        for type_, felt in kinds:
+        for type_, touch in kinds:
             score = scores[type_](1.0) + 0.005 * (seeds - 1)
-            place = (felt.placement, resolution, felt.noise) if felt else ("", resolution, "")
+            place = (touch.placement, resolution, touch.noise) if touch else ("", resolution, "")
             bounds = (score, score - 0.1, score + 0.1)
             rows.append(Row(type_, *place, seeds, *bounds, 0.9, 100 * seeds, ITERATIONS * STEPS * ROWS, 25.0))
     write_table(rows, folder / "table.csv")

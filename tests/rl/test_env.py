@@ -13,7 +13,7 @@ from torch._inductor import config as inductor
 from tgdsl.errors import SimulationError, SpecError
 from tgdsl.module.module import TactileModule
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.sensed import Felt
+from tgdsl.rl.sensors import PolicyTouch
 from tgdsl.runtime import connect
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.connect import SOURCES
@@ -382,7 +382,7 @@ def test_an_error_in_an_override_names_the_override(tmp_path):
     task = write_task(tmp_path, more="touch: depth\n")
     for options, message in (
         ({"overrides": {"placement": "tipps"}}, '--set placement=tipps: placement: no link matches "tipps"'),
-        ({"feels": [Felt("depth", "tipps", "clean")]}, 'placement: no link matches "tipps"'),
+        ({"touches": [PolicyTouch("depth", "tipps", "clean")]}, 'placement: no link matches "tipps"'),
     ):
         with pytest.raises(SpecError) as error:
             TouchEnv(task, 2, threads=1, **options)

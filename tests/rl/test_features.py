@@ -10,7 +10,7 @@ import torch
 from pincer_tasks import pincer_env
 from tiny_tasks import RADIUS, tiny_env
 
-from tgdsl.rl.sensed import Felt
+from tgdsl.rl.sensors import PolicyTouch
 
 PLAIN = {"physics.substeps": 1, "touch": "depth", "proprio.vel_scale": 0.2}
 """With one physics step, readings are those at the start of the control step."""
@@ -148,9 +148,13 @@ def test_an_observation_can_be_rebuilt_from_its_description(tmp_path, name):
 
 
 def test_partial_readings_of_a_sensor_are_described(tmp_path):
-    felts = [Felt("agg_force", "left", "clean"), Felt("force", "right", "clean"), Felt("agg_bool", "hand", "clean")]
-    env = tiny_env(tmp_path, 1, feels=[*felts, Felt("force", "left", "clean")])
-    force, taxel_forces, bits = (env.describe()[felt.group] for felt in felts)
+    touches = [
+        PolicyTouch("agg_force", "left", "clean"),
+        PolicyTouch("force", "right", "clean"),
+        PolicyTouch("agg_bool", "hand", "clean"),
+    ]
+    env = tiny_env(tmp_path, 1, touches=[*touches, PolicyTouch("force", "left", "clean")])
+    force, taxel_forces, bits = (env.describe()[touch.group] for touch in touches)
     sums = [(f"sum of depth times normal, {axis}", "left", 1e4, 1) for axis in "zyx"]
     assert [(each.name, each.link, each.scale, each.size) for _, each in force] == sums
     names = [(f"force_{axis}", "right", range(2, 4)) for axis in "xyz"]

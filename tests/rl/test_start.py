@@ -8,7 +8,7 @@ from tgdsl.errors import SimulationError, SpecError
 from tgdsl.rl import env as env_file
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
-from tgdsl.rl.sensed import num_variants
+from tgdsl.rl.sensors import num_variants
 
 VARIANTS = """objects:
   ball:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from tgdsl.rl.load import load_task
-from tgdsl.rl.sensed import compile_sensed
+from tgdsl.rl.sensors import compile_sensors
 from tgdsl.scene.scene import Choice, SceneModels
 
 TASKS = Path(__file__).parents[2] / "examples" / "tasks"
@@ -25,13 +25,13 @@ pytestmark = pytest.mark.slow
 def test_every_variant_of_an_object_resists_twisting(task):
     name, limit = LIMITS[task]
     loaded = load_task(TASKS / f"{task}.yaml", {"touch": "none"})
-    sensed = compile_sensed(loaded, "cpu")
-    scene = sensed.touch.plan.scene
+    sensors = compile_sensors(loaded, "cpu")
+    scene = sensors.touch.plan.scene
     models = SceneModels(scene, loaded.spec.physics.options)
     (scene_object,) = [candidate for candidate in scene.objects if candidate.name == name]
     for variant in range(len(scene_object.variants)):
         model = models.model({name: Choice(variant)})
-        geoms = [i for i in range(model.ngeom) if model.body(int(model.geom_bodyid[i])).name == sensed.object]
+        geoms = [i for i in range(model.ngeom) if model.body(int(model.geom_bodyid[i])).name == sensors.object]
         colliding = [i for i in geoms if model.geom_contype[i] or model.geom_conaffinity[i]]
         assert colliding
         for i in colliding:

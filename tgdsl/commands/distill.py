@@ -157,8 +157,8 @@ class _Part:
 
     def __init__(self, command: Distill, resolution: str, settings: dict[str, Any], overrides: dict[str, Any], folder: Path):
         from tgdsl.rl.load import load_task
-        from tgdsl.rl.sensed import check_felt, num_variants, types_of
-        from tgdsl.rl.students.keys import Teacher, check_blocks, feels, student_keys, students_task
+        from tgdsl.rl.sensors import check_touch, num_variants, types_of
+        from tgdsl.rl.students.keys import Teacher, check_blocks, student_keys, students_task, touches
         from tgdsl.rl.train.folder import RunFolder
 
         self._command, self.resolution, self._settings, self._folder = command, resolution, settings, RunFolder(folder)
@@ -169,15 +169,15 @@ class _Part:
         types = [name for type_ in settings["types"] for name in (types_of(self._loaded) if type_ == "all" else [type_])]
         self._keys = student_keys(types, settings["placements"], settings["noise"], settings["seeds"])
         self.teacher = Teacher(Path(settings["teacher"]), self._loaded)
-        self._felt = feels(self._keys, self.teacher.felt)
-        check_felt(self._loaded, self._felt)
+        self._touches = touches(self._keys, self.teacher.touch)
+        check_touch(self._loaded, self._touches)
         unit = len(self._keys) * num_variants(self._loaded)
         self.envs = settings["envs"] or max(1, ENVS // unit) * unit
         check_blocks(self.envs, len(self._keys), num_variants(self._loaded))
 
     def check(self, is_resumed: bool) -> None:
         """Read the checkpoint; raise an error if the run cannot begin or go on, or the teacher feels with other taxels."""
-        from tgdsl.rl.sensed import compile_sensed
+        from tgdsl.rl.sensors import compile_sensors
         from tgdsl.rl.train.folder import read_checkpoint
 
         self._goes_on = is_resumed and self._folder.has_run  # one that had not begun begins
@@ -187,7 +187,7 @@ class _Part:
         check_writable(self._folder.checkpoint)
         self.teacher.check_taxels()
         if len(self._settings["resolutions"]) > 1:  # else it is compiled next
-            compile_sensed(self._loaded, "cpu", feels=self._felt)
+            compile_sensors(self._loaded, "cpu", touches=self._touches)
 
     def teach(self, file: Path | None) -> tuple[list[Row], str]:
         """Teach, write and evaluate; return the table's rows, and the unit of the score.
@@ -203,7 +203,7 @@ class _Part:
         command, folder, loaded, state = self._command, self._folder, self._loaded, self._state
         teacher_file, seed = self._settings["teacher"], self._settings["seed"]
         with StatusLine() as progress:
-            env = TouchEnv(loaded, self.envs, device=command.device, seed=seed, feels=self._felt, progress=progress)
+            env = TouchEnv(loaded, self.envs, device=command.device, seed=seed, touches=self._touches, progress=progress)
         try:
             distiller = Distiller(env, loaded, self.teacher.bound(env), self._keys, seed)
             if file is not None:

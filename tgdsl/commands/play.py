@@ -88,8 +88,8 @@ class Play:
 
         live, tally = LiveTable(), Tally(env)
         on_taxels = [output for output in env.touch.outputs if output.rows == "taxel" and output.kind != "surface_distance"]
-        felt = {output.name: env.now.readings[output.name] for output in on_taxels}  # a distance is read without touch too
-        trace = TouchTrace(env.touch, chosen_output(env.touch, felt), steps) if felt else None
+        readings = {output.name: env.now.readings[output.name] for output in on_taxels}  # a distance is read without touch too
+        trace = TouchTrace(env.touch, chosen_output(env.touch, readings), steps) if readings else None
         with args.progress_bar("playing", steps) as bar:
             for moment in rollout(actor, env, steps):
                 record.add(moment)
@@ -285,7 +285,7 @@ class Grasps:
         from tgdsl.rl.grasps.grasps import grasp_spec, write_grasps
         from tgdsl.rl.grasps.sampling import cached_grasps
         from tgdsl.rl.load import load_task
-        from tgdsl.rl.sensed import compile_sensed
+        from tgdsl.rl.sensors import compile_sensors
         from tgdsl.rl.start import moved_joints
 
         if self.out is not None:
@@ -296,8 +296,8 @@ class Grasps:
         if spec is None:
             raise TgdslError(f"{self.document}: episodes of the task {loaded.spec.task} do not begin with grasps")
         with StatusLine() as progress:
-            sensed = compile_sensed(loaded, "cpu", progress, only=("link_contact",))
-        joints, scene = moved_joints(loaded, sensed), sensed.touch.plan.scene
+            sensors = compile_sensors(loaded, "cpu", progress, only=("link_contact",))
+        joints, scene = moved_joints(loaded, sensors), sensors.touch.plan.scene
         with args.progress_bar("sampling", spec.num, "grasp") as bar:
 
             def count(num: int, _: int) -> None:

@@ -16,7 +16,7 @@ from tgdsl.console.tables import text_table
 from tgdsl.observations.observations import PerLink
 from tgdsl.rl.groups import link_forces, runs_of
 from tgdsl.rl.load import LoadedTask
-from tgdsl.rl.sensed import Sensed, Source, sensors_document
+from tgdsl.rl.sensors import Source, TaskSensors, sensors_document
 from tgdsl.rl.task import Features, Task
 from tgdsl.rl.terms import ObservationTerm, Term
 
@@ -48,7 +48,7 @@ class Description(dict[str, tuple[tuple[slice, Features], ...]]):
 
 
 def describe(
-    loaded: LoadedTask, sensed: Sensed, task: Task[Any], terms: Mapping[str, Term], sizes: Mapping[str, int]
+    loaded: LoadedTask, sensors: TaskSensors, task: Task[Any], terms: Mapping[str, Term], sizes: Mapping[str, int]
 ) -> Description:
     """Return the features of each group of observations."""
     setup, substeps = task.setup, loaded.spec.physics.substeps if loaded.spec.temporal == "stack" else 0
@@ -57,7 +57,7 @@ def describe(
         "proprio": _joints(names, is_slide, loaded.spec.proprio.vel_scale),
         "priv_proprio": [*_joints(names, is_slide, 1.0), *link_forces(setup.links)],
     }
-    by_group |= {name: _touch(sensed, source, substeps) for name, source in sensed.groups.items()} | dict(task.describe())
+    by_group |= {name: _touch(sensors, source, substeps) for name, source in sensors.groups.items()} | dict(task.describe())
     by_group |= {name: term.describe(setup) for name, term in terms.items() if isinstance(term, ObservationTerm)}
     result, notes = {}, _notes(loaded)
     for group, size in sizes.items():
@@ -87,9 +87,9 @@ def _joints(names: Sequence[str], is_slide: Sequence[bool], vel_scale: float) ->
     return pos + vel + [Features(f"last action of {name}", 1) for name in names]
 
 
-def _touch(sensed: Sensed, source: Source, substeps: int) -> list[Features]:
+def _touch(sensors: TaskSensors, source: Source, substeps: int) -> list[Features]:
     """Return the features of a group of touch: by physics step if these are stacked, then channel, then link."""
-    touch = sensed.touch
+    touch = sensors.touch
     (term,) = (term for term in touch.plan.observations if term.group == source.observation)
     assert term.reading is not None
     (output,) = (output for output in touch.outputs if output.name == term.reading)

@@ -32,7 +32,7 @@ from tgdsl.rl.draws import Draws
 from tgdsl.rl.events import Curricula, Events, event_terms
 from tgdsl.rl.grasps.sampling import with_grasps
 from tgdsl.rl.load import LoadedTask, load_task
-from tgdsl.rl.sensed import Felt, Sensed, SubstepTouch, compile_sensed
+from tgdsl.rl.sensors import PolicyTouch, SubstepTouch, TaskSensors, compile_sensors
 from tgdsl.rl.start import make_setup, make_simulation, moved_joints
 from tgdsl.rl.task import Now, Start, checked
 from tgdsl.rl.terms import ObservationTerm, RewardTerm, TerminationTerm
@@ -95,7 +95,7 @@ class TouchEnv:
 
     Attributes:
         groups: Size of each group of observations.
-        felt: Sources of the groups of touch.
+        touch_sources: Sources of the groups of touch.
         joint_names: Joints that the policy moves, in the order of actions.
         control_step: Duration of a control step [s].
         max_steps: Largest number of control steps of an episode.
@@ -120,8 +120,8 @@ class TouchEnv:
         threads: int = 0,
         compiled: bool | None = None,
         first_env: int = 0,
-        feels: Sequence[Felt] | None = None,
-        sensed: Sensed | None = None,
+        touches: Sequence[PolicyTouch] | None = None,
+        sensors: TaskSensors | None = None,
         progress: Progress | None = None,
     ):
         """Make the environments and begin an episode in each.
@@ -137,9 +137,9 @@ class TouchEnv:
             threads: CPU threads of physics; 0: one per CPU.
             compiled: Whether torch compiles the module and the rest of a step, except physics; default: on a GPU.
             first_env: Index of the first environment across all processes, for random numbers and variants.
-            feels: Touch of several policies, each an observation group `Felt.group`. They replace the document's `touch`,
-                `placement` and `noise`, and the group `tactile_sensors`.
-            sensed: The result of `compile_sensed`, to use instead of the document's sensors; its module is not copied.
+            touches: Touch of several policies, each an observation group `PolicyTouch.group`. They replace the document's
+                `touch`, `placement` and `noise`, and the group `tactile_sensors`.
+            sensors: The result of `compile_sensors`, to use instead of the document's sensors; its module is not copied.
             progress: Function that takes a line of text about each long job.
 
         Raises:
@@ -148,18 +148,18 @@ class TouchEnv:
         """
         device = str(device)
         loaded = self.loaded = task if isinstance(task, LoadedTask) else load_task(task, overrides)
-        self.spec, sensed = loaded.spec, sensed or compile_sensed(loaded, device, progress, feels=feels)
-        self.touch, self.felt, self._sensed = sensed.touch, sensed.groups, sensed
+        self.spec, sensors = loaded.spec, sensors or compile_sensors(loaded, device, progress, touches=touches)
+        self.touch, self.touch_sources, self._sensors = sensors.touch, sensors.groups, sensors
         is_cuda = self.touch.device.type == "cuda"
         is_compiled = is_cuda if compiled is None else compiled
         self.touch.memory.keeps_last = True  # of environments that do not begin again while others do
         if is_compiled:
             self.touch.compile(dynamic=not is_cuda)  # a GPU reads all environments each time, a CPU any number of them
-        self.joint_names = moved_joints(loaded, sensed)
-        self.sim = make_simulation(loaded, sensed, self.joint_names, num_envs, device, simulator, threads, first_env)
+        self.joint_names = moved_joints(loaded, sensors)
+        self.sim = make_simulation(loaded, sensors, self.joint_names, num_envs, device, simulator, threads, first_env)
         self.num_envs, self.num_actions, self.device = num_envs, len(self.joint_names), self.touch.device
         draws = Draws(seed, num_envs, self.sim.qpos.device, first_env, is_compiled=is_compiled)
-        setup = make_setup(loaded, sensed, self.sim, self.joint_names, draws, first_env)
+        setup = make_setup(loaded, sensors, self.sim, self.joint_names, draws, first_env)
         setup = with_grasps(setup, loaded, self.sim, self.touch.plan.scene, progress)
         self.curricula = Curricula(loaded, self.sim.qpos)
         try:
@@ -182,8 +182,8 @@ class TouchEnv:
         is_measured = self.spec.joint_vel == "measured"
         self._speeds = groups.MeasuredVelocity(self.actuation.target, setup.control_step) if is_measured else None
         self._restarted = FusedCall(self._restart, is_compiled)
-        is_stacked = self.spec.temporal == "stack" and sensed.groups
-        self._substeps = SubstepTouch(sensed, self.sim) if is_stacked else None
+        is_stacked = self.spec.temporal == "stack" and sensors.groups
+        self._substeps = SubstepTouch(sensors, self.sim) if is_stacked else None
         self._commanded = FusedCall(self._command, is_compiled)
         self._judged = FusedCall(self._judge, is_compiled)
         self._observed = FusedCall(self._observe, is_compiled)
@@ -278,7 +278,7 @@ class TouchEnv:
 
     def describe(self) -> Description:
         """Return a description of each feature of each group of observations; it prints as a table."""
-        return describe(self.loaded, self._sensed, self.task, self.curricula.terms, self.groups)
+        return describe(self.loaded, self._sensors, self.task, self.curricula.terms, self.groups)
 
     def follow(self, control: Float[Tensor, "env nu"]) -> Step:
         """Make one control step towards external set-points, such as a hand's serial line reports, without a policy.
@@ -302,9 +302,9 @@ class TouchEnv:
         Raises:
             SimulationError: If the policy has no touch, there are several policies, or no step followed `load_state_dict`.
         """
-        if self._sensed.felt is None:
+        if self._sensors.policy_sensor is None:
             raise SimulationError("the policy feels nothing: touch is none; or there are several policies")
-        return self.touch.images(self._sensed.felt, self.now.readings)
+        return self.touch.images(self._sensors.policy_sensor, self.now.readings)
 
     def state_dict(self) -> dict[str, dict[str, Tensor]]:
         """Return copies of the environments' whole state, without the policy.
@@ -456,11 +456,11 @@ class TouchEnv:
 
     def _now(self, readings: dict[str, Tensor]) -> Now:
         watched, none, num = self.sim.watched(), self._used[:, :0], self.num_actions
-        distance = self._sensed.distance
-        force, normal_force = self._sensed.forces(readings, self._used)
+        distance = self._sensors.distance
+        force, normal_force = self._sensors.forces(readings, self._used)
         return Now(
             watched=watched,
-            object=watched.body(self._sensed.object),
+            object=watched.body(self._sensors.object),
             joint_pos=watched.joint_pos[:, :num],
             joint_vel=watched.joint_vel[:, :num],
             target=self.actuation.target,
@@ -478,11 +478,11 @@ class TouchEnv:
         )
 
     def _observe(self, now: Now) -> Observations:
-        felt = self._sensed.observe(now.readings) if self._substeps is None else self._substeps.observe()
+        touch = self._sensors.observe(now.readings) if self._substeps is None else self._substeps.observe()
         measured = replace(now, joint_vel=self._speeds.value) if self._speeds else now
         count = (self.resets << 32) | self.steps
         proprio = groups.noisy_proprio(measured, self.spec.proprio, self._draws, count)
-        result = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now)}
+        result = {"proprio": proprio} | touch | {"priv_proprio": groups.priv_proprio(now)}
         task = type(self.task).__name__
         for name, term in self.curricula.terms.items():
             if isinstance(term, ObservationTerm):

@@ -14,7 +14,7 @@ from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.events import event_terms
 from tgdsl.rl.load import LoadedTask
-from tgdsl.rl.sensed import Sensed
+from tgdsl.rl.sensors import TaskSensors
 from tgdsl.rl.task import Setup, free_qpos
 from tgdsl.runtime.connect import simulator_for
 from tgdsl.runtime.connection import keyword_options
@@ -25,9 +25,9 @@ from tgdsl.scene.scene import SceneModels, is_absent
 from tgdsl.schema.select import is_plain, matching
 
 
-def moved_joints(loaded: LoadedTask, sensed: Sensed) -> tuple[str, ...]:
+def moved_joints(loaded: LoadedTask, sensors: TaskSensors) -> tuple[str, ...]:
     """Return the joints that the policy moves, in the order of the actuators."""
-    model = SceneModels(sensed.touch.plan.scene).model({})
+    model = SceneModels(sensors.touch.plan.scene).model({})
     of_actuators = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, 0]
     joint_names = list(dict.fromkeys(model.joint(int(i)).name for i in of_actuators))
     problems: list[Problem] = []
@@ -50,7 +50,7 @@ def moved_joints(loaded: LoadedTask, sensed: Sensed) -> tuple[str, ...]:
 
 def make_simulation(
     loaded: LoadedTask,
-    sensed: Sensed,
+    sensors: TaskSensors,
     joints: tuple[str, ...],
     num_envs: int,
     device: str,
@@ -61,11 +61,11 @@ def make_simulation(
     """Simulate the task's scene; environments with faults wait for a reset."""
     spec = loaded.spec
     task_watch = loaded.task.watch(spec)
-    links = contact_links(sensed) if any(term.watches_links for term in loaded.terms.values()) else ()
+    links = contact_links(sensors) if any(term.watches_links for term in loaded.terms.values()) else ()
     watch = Watch(
-        bodies=tuple(dict.fromkeys((sensed.object, *task_watch.bodies, *links))),
+        bodies=tuple(dict.fromkeys((sensors.object, *task_watch.bodies, *links))),
         sites=task_watch.sites,
-        joints=tuple(dict.fromkeys((*joints, *task_watch.joints, *sensed.touch.inputs.joints))),
+        joints=tuple(dict.fromkeys((*joints, *task_watch.joints, *sensors.touch.inputs.joints))),
         actuators=task_watch.actuators,
         pairs=task_watch.pairs,
     )
@@ -75,30 +75,30 @@ def make_simulation(
     options |= spec.physics.capacities
     kind = simulator_for(device, simulator)
     keywords = keyword_options(kind.simulate)
-    sim = kind.simulate(sensed.touch, num_envs, **{name: value for name, value in options.items() if name in keywords})
-    num_variants = sensed.num_variants(spec.object)
+    sim = kind.simulate(sensors.touch, num_envs, **{name: value for name, value in options.items() if name in keywords})
+    num_variants = sensors.num_variants(spec.object)
     if first_env % num_variants:
         sim.set_objects({spec.object: (np.arange(num_envs) + first_env) % num_variants})
     return sim
 
 
 def make_setup(
-    loaded: LoadedTask, sensed: Sensed, sim: Simulation, joints: tuple[str, ...], draws: Draws, first_env: int = 0
+    loaded: LoadedTask, sensors: TaskSensors, sim: Simulation, joints: tuple[str, ...], draws: Draws, first_env: int = 0
 ) -> Setup:
     """Return the setup of a task without grasps."""
     try:
         actuators = Actuators.of(sim.model, joints)
     except SimulationError as error:
         raise loaded.error(("joints",), str(error)) from error
-    num_variants = sensed.num_variants(loaded.spec.object)
-    friction, mass = (get(sensed.object).to(sim.qpos).clone() for get in (sim.properties.friction, sim.properties.mass))
+    num_variants = sensors.num_variants(loaded.spec.object)
+    friction, mass = (get(sensors.object).to(sim.qpos).clone() for get in (sim.properties.friction, sim.properties.mass))
     keyframe = sim.qpos[0].double().cpu().numpy()
-    heights = [half_height(sim.env_model(i), sensed.object, keyframe) for i in range(min(num_variants, sim.num_envs))]
+    heights = [half_height(sim.env_model(i), sensors.object, keyframe) for i in range(min(num_variants, sim.num_envs))]
     heights = torch.tensor(heights, dtype=sim.qpos.dtype)[torch.arange(sim.num_envs) % num_variants].to(sim.qpos.device)
-    start, free = sim.qpos[0].repeat(sim.num_envs, 1), free_qpos(sim.model, sensed.object)
+    start, free = sim.qpos[0].repeat(sim.num_envs, 1), free_qpos(sim.model, sensors.object)
     if free is not None:
-        plain_model = SceneModels(sensed.touch.plan.scene).model({})
-        start[:, free.start + 2] += heights - half_height(plain_model, sensed.object, keyframe)
+        plain_model = SceneModels(sensors.touch.plan.scene).model({})
+        start[:, free.start + 2] += heights - half_height(plain_model, sensors.object, keyframe)
     return Setup(
         num_envs=sim.num_envs,
         device=sim.qpos.device,
@@ -109,8 +109,8 @@ def make_setup(
         low=torch.from_numpy(actuators.low).to(sim.qpos),
         high=torch.from_numpy(actuators.high).to(sim.qpos),
         max_torque=torch.from_numpy(actuators.limit).to(sim.qpos),
-        object=sensed.object,
-        links=contact_links(sensed),
+        object=sensors.object,
+        links=contact_links(sensors),
         qpos=sim.qpos[0].clone(),
         start=start,
         half_height=heights,
@@ -122,13 +122,13 @@ def make_setup(
         scene_friction=friction.clone(),
         scene_mass=mass.clone(),
         draws=draws,
-        rows={kind: (name, sensed.touch.rows[name]) for kind, name in sensed.by_kind.items()},
+        rows={kind: (name, sensors.touch.rows[name]) for kind, name in sensors.by_kind.items()},
     )
 
 
-def contact_links(sensed: Sensed) -> tuple[str, ...]:
+def contact_links(sensors: TaskSensors) -> tuple[str, ...]:
     """Return the bodies of the `link_contact` sensor's rows; none if the task takes none."""
-    return tuple(sensed.touch.rows[sensed.contact]["body"].tolist()) if sensed.contact else ()
+    return tuple(sensors.touch.rows[sensors.contact]["body"].tolist()) if sensors.contact else ()
 
 
 def half_height(model: mujoco.MjModel, body: str, qpos: Float[np.ndarray, " nq"]) -> float:

@@ -14,7 +14,7 @@ from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.grasps import sampling as loading
 from tgdsl.rl.grasps.grasps import Grasps, GraspTable, read_grasps, write_grasps
 from tgdsl.rl.load import load_task
-from tgdsl.rl.sensed import compile_sensed
+from tgdsl.rl.sensors import compile_sensors
 from tgdsl.runtime.simulators.state_values import FIELDS
 from tgdsl.scene.scene import scene_digest
 
@@ -46,7 +46,7 @@ def forbid_sampling(monkeypatch):
 
 def digest_of(document, **overrides):
     loaded = load_task(document, overrides)
-    return scene_digest(compile_sensed(loaded, "cpu").touch.plan.scene)
+    return scene_digest(compile_sensors(loaded, "cpu").touch.plan.scene)
 
 
 def refusal(call):

@@ -8,7 +8,7 @@ import torch
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
 from tgdsl.rl.playing.policy import Policy, check_card, check_learned, policy_for, read_policy
-from tgdsl.rl.sensed import compile_sensed
+from tgdsl.rl.sensors import compile_sensors
 from tgdsl.rl.start import moved_joints
 
 REPOSITORY = Path(__file__).parents[3]
@@ -26,9 +26,9 @@ PER_TAXEL = {"none": 0, "bool": 1, "depth": 1, "force_taxel": 3, "force": 3, "pr
 def taxels_of(document, touch, resolution, placement):
     """Return the touch module, the link of each taxel, and the moved joints of a task."""
     loaded = load_task(document, {"touch": touch, "resolution": resolution, "placement": placement})
-    sensed = compile_sensed(loaded, "cpu")
-    links = [link for felt in sensed.groups.values() for link in felt.layout.link_id.tolist()]
-    return sensed.touch, links, moved_joints(loaded, sensed)
+    sensors = compile_sensors(loaded, "cpu")
+    links = [link for touch in sensors.groups.values() for link in touch.layout.link_id.tolist()]
+    return sensors.touch, links, moved_joints(loaded, sensors)
 
 
 @pytest.mark.parametrize("file", POLICIES, ids=lambda file: file.stem)
@@ -53,8 +53,8 @@ def test_policies_of_the_wheel_fit_their_tasks(name):
     spec = load_task(REPOSITORY / card["task"], card["overrides"]).spec
     touch, links, joints = taxels_of(REPOSITORY / card["task"], spec.touch, spec.resolution, spec.placement)
     check_card(saved, joints, touch)
-    felt = 3 * len(set(links)) if spec.touch == "agg_force" else PER_TAXEL[spec.touch] * len(links)
-    sizes = {"proprio": 3 * len(joints), "tactile_sensors": felt}
+    touch = 3 * len(set(links)) if spec.touch == "agg_force" else PER_TAXEL[spec.touch] * len(links)
+    sizes = {"proprio": 3 * len(joints), "tactile_sensors": touch}
     assert {**card["groups"], **sizes} == {**sizes, **card["groups"]}
 
 

@@ -8,7 +8,7 @@ from written_teachers import FindRidge, teacher
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
 from tgdsl.rl.playing.evaluation import evaluate_each
-from tgdsl.rl.students.keys import Teacher, feels, student_keys
+from tgdsl.rl.students.keys import Teacher, student_keys, touches
 from tgdsl.rl.students.learner import Distiller
 
 TASK = Path(__file__).parents[3] / "examples" / "tasks" / "find_ridge.yaml"
@@ -30,7 +30,7 @@ def test_only_students_with_touch_reach_their_teacher(tmp_path):
     ridge_teacher = Teacher(teacher(tmp_path / "teacher.pt", loaded, ["command", "tactile_sensors"], FindRidge()), loaded)
     ridge_teacher.check_taxels()
     keys = student_keys(["depth", "bool", "none"], ["tips"], ["clean"], 1)
-    env = TouchEnv(loaded, 96, threads=1, feels=feels(keys, ridge_teacher.felt))
+    env = TouchEnv(loaded, 96, threads=1, touches=touches(keys, ridge_teacher.touch))
     try:
         distiller = Distiller(env, loaded, ridge_teacher.bound(env), keys, 0)
         for _ in range(25):

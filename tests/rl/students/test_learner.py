@@ -12,8 +12,8 @@ from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
 from tgdsl.rl.playing.evaluation import evaluate, evaluate_each
 from tgdsl.rl.playing.policy import policy_for, read_policy
-from tgdsl.rl.sensed import Felt
-from tgdsl.rl.students.keys import Teacher, feels, student_keys
+from tgdsl.rl.sensors import PolicyTouch
+from tgdsl.rl.students.keys import Teacher, student_keys, touches
 from tgdsl.rl.students.learner import Distiller
 from tgdsl.rl.train.folder import CheckpointError, read_checkpoint, write_checkpoint
 from tgdsl.rl.train.run import restore, state_of
@@ -53,7 +53,7 @@ def make(tmp_path):
         loaded = load_task(task, dotted)
         keys = student_keys(types, placements, ["clean"], seeds)
         policy = Teacher(files[sees], loaded)
-        envs.append(TouchEnv(loaded, num_envs or 2 * len(keys), seed=1, threads=1, feels=feels(keys, policy.felt)))
+        envs.append(TouchEnv(loaded, num_envs or 2 * len(keys), seed=1, threads=1, touches=touches(keys, policy.touch)))
         return Distiller(envs[-1], loaded, policy.bound(envs[-1]), keys, 0)
 
     yield distiller
@@ -329,9 +329,9 @@ def test_a_teacher_may_use_touch(make, tmp_path):
     file = teacher(tmp_path / "feeling.pt", loaded, ["proprio", "tactile_sensors"])
     policy = Teacher(file, loaded)
     policy.check_taxels()
-    assert policy.felt == Felt("depth", "all", "clean")
+    assert policy.touch == PolicyTouch("depth", "all", "clean")
     keys = student_keys(["bool"], ["ends"], ["clean"], 1)
-    env = TouchEnv(loaded, 2, seed=1, threads=1, feels=feels(keys, policy.felt))
+    env = TouchEnv(loaded, 2, seed=1, threads=1, touches=touches(keys, policy.touch))
     try:
         bound, obs = policy.bound(env), env.reset(4)
         assert bound.groups == ("proprio", "tactile_sensors/depth/all/clean")

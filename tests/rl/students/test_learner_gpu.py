@@ -7,7 +7,7 @@ from written_teachers import teacher
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
-from tgdsl.rl.students.keys import Teacher, feels, student_keys
+from tgdsl.rl.students.keys import Teacher, student_keys, touches
 from tgdsl.rl.students.learner import Distiller
 from tgdsl.rl.train.graphs import Captured, SideBySide
 
@@ -36,7 +36,7 @@ def distillers(request, tmp_path):
     keys, student_teacher = student_keys(["depth", "bool", "none"], ["ends", "all"], ["clean"], 2), Teacher(file, loaded)
     pair = []
     for _ in range(2):
-        env = TouchEnv(loaded, 4 * len(keys), seed=1, device="cuda", feels=feels(keys, student_teacher.felt))
+        env = TouchEnv(loaded, 4 * len(keys), seed=1, device="cuda", touches=touches(keys, student_teacher.touch))
         pair.append(Distiller(env, loaded, student_teacher.bound(env), keys, 0))
     for part in vars(pair[1]).values():
         if isinstance(part, Captured):

@@ -15,7 +15,7 @@ from written_teachers import teacher
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
 from tgdsl.rl.students import learner
-from tgdsl.rl.students.keys import Teacher, feels, student_keys
+from tgdsl.rl.students.keys import Teacher, student_keys, touches
 from tgdsl.rl.students.learner import Distiller
 from tgdsl.rl.students.student import Stack, Student
 
@@ -164,7 +164,7 @@ def make(files, monkeypatch):
         loaded = load_task(task, {f"distill.{name}": value for name, value in spec.items()})
         keys = student_keys(["depth", "bool", "none"], ["ends"], ["clean"], 1)
         student_teacher = Teacher(file, loaded)
-        envs.append(TouchEnv(loaded, ROWS * len(keys), seed=1, threads=1, feels=feels(keys, student_teacher.felt)))
+        envs.append(TouchEnv(loaded, ROWS * len(keys), seed=1, threads=1, touches=touches(keys, student_teacher.touch)))
         bound = student_teacher.bound(envs[-1])
         monkeypatch.setattr(learner, "Stack", partial(Stack, dtype=torch.float64))
         torch.set_default_dtype(torch.float64)

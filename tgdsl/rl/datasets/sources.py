@@ -25,7 +25,7 @@ from tgdsl.rl.deploying.deploy import Deployment
 from tgdsl.rl.deploying.hand import EMULATED
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.rollout import Actor, rollout
-from tgdsl.rl.sensed import GROUP
+from tgdsl.rl.sensors import GROUP
 from tgdsl.rl.task import Task
 from tgdsl.runtime.connect import kind_of
 from tgdsl.runtime.xhand1.calibration import Calibration
@@ -113,14 +113,14 @@ def of_deployment(
     least: float | None = None,
 ) -> tuple[Header, Iterator[Episode]]:
     """Return episodes of a policy on an emulated hand, a real one or a log: the force on each fingertip."""
-    prepared, felt = deployment.prepared, deployment.prepared.felt
-    if felt is None or felt.type != EMULATED or "proprio" not in prepared.groups:
-        problem = f"this policy feels {'nothing' if felt is None else felt.type}"
+    prepared, touch = deployment.prepared, deployment.prepared.touch
+    if touch is None or touch.type != EMULATED or "proprio" not in prepared.groups:
+        problem = f"this policy feels {'nothing' if touch is None else touch.type}"
         raise TgdslError(f"{prepared.saved.file}: {problem}; of a hand, expected one that feels {EMULATED}, and proprio")
     if deployment.has_scene and "motion" not in kind_of(deployment.source).options:
         raise TgdslError(f"--source {deployment.source}: a simulation's forces on taxels come from --source environments")
     num = len(prepared.moved.names)
-    links = {link.name: LinkTaxels(link.body) for link in prepared.sensed.groups[felt.group].layout.links}
+    links = {link.name: LinkTaxels(link.body) for link in prepared.sensors.groups[touch.group].layout.links}
     header = Header(
         prepared.loaded.source.file,
         prepared.loaded.spec.task.replace("_", " "),

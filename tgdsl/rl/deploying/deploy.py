@@ -233,7 +233,7 @@ class Deployment:
         policy = prepared.policy()
         if self.has_scene:
             for episode in range(episodes):
-                env = TouchEnv(prepared.loaded, 1, threads=1, first_env=episode, sensed=prepared.sensed, **self._env_options)
+                env = TouchEnv(prepared.loaded, 1, threads=1, first_env=episode, sensors=prepared.sensors, **self._env_options)
                 scene = TaskScene(env)
                 with self._connected(scene) as connection:
                     yield from self._episode(episode, connection, policy, num_steps, scene)
@@ -275,7 +275,7 @@ class Deployment:
 
     def _connected(self, scene: TaskScene | None) -> Connection:
         """Connect; a scene is closed with the connection, or if there is none."""
-        touch, control_step = self.prepared.sensed.touch, self.prepared.control_step
+        touch, control_step = self.prepared.sensors.touch, self.prepared.control_step
         with ExitStack() as opened:
             if scene is not None:
                 opened.callback(scene.close)

@@ -38,7 +38,7 @@ from tgdsl.rl.playing.policy import (
     check_learned,
     read_policy,
 )
-from tgdsl.rl.sensed import GROUP, Felt, Sensed, compile_sensed
+from tgdsl.rl.sensors import GROUP, PolicyTouch, TaskSensors, compile_sensors
 from tgdsl.rl.spec import ProprioSpec
 from tgdsl.rl.start import moved_joints
 from tgdsl.rl.task import HandNow
@@ -65,8 +65,8 @@ class Prepared:
 
     saved: PolicyFile
     loaded: LoadedTask  # the task's document, with the policy's touch and goal
-    sensed: Sensed  # its module: the sensors of policy and task, and the joints
-    felt: Felt | None  # the policy's touch; None without touch
+    sensors: TaskSensors  # its module: the sensors of policy and task, and the joints
+    touch: PolicyTouch | None  # the policy's touch; None without touch
     groups: Mapping[str, int]  # groups of observations that it takes, in its order, with their sizes
     goal: tuple[float, ...] | None  # the user's goal; None: the goal of the scene's task
     model: mujoco.MjModel
@@ -119,18 +119,18 @@ def prepare(
     if goal:
         loaded = _with_goal(loaded, tuple(goal))
     spec = loaded.spec
-    felt = Felt(spec.touch, spec.placement, spec.noise) if GROUP in names and spec.touch != "none" else None
-    if felt is not None and spec.temporal == "stack":
+    touch = PolicyTouch(spec.touch, spec.placement, spec.noise) if GROUP in names and spec.touch != "none" else None
+    if touch is not None and spec.temporal == "stack":
         problem = f"this policy feels at each of {spec.physics.substeps} physics steps of a control step (temporal: stack)"
         raise DeployError(f"{policy}: {problem}, and a hand feels once; teach one with temporal: last")
-    feels = [] if felt is None else [felt]
-    if is_emulated and felt is not None and felt.is_per_link and felt.type != EMULATED:
-        feels.append(felt._replace(type=EMULATED))
+    touches = [] if touch is None else [touch]
+    if is_emulated and touch is not None and touch.is_per_link and touch.type != EMULATED:
+        touches.append(touch._replace(type=EMULATED))
     also = {name: [{"type": name}] for name in (JOINT_POS, JOINT_VEL)}
-    sensed = compile_sensed(loaded, device, progress, feels=feels, also=also)
-    moved, model = moved_joints(loaded, sensed), SceneModels(sensed.touch.plan.scene).model({})
+    sensors = compile_sensors(loaded, device, progress, touches=touches, also=also)
+    moved, model = moved_joints(loaded, sensors), SceneModels(sensors.touch.plan.scene).model({})
     if card is not None:
-        check_card(saved, moved, sensed.touch)
+        check_card(saved, moved, sensors.touch)
         changes += changes_around(card, loaded, model)
     try:
         actuators = Actuators.of(model, moved)
@@ -139,10 +139,10 @@ def prepare(
     sizes = {name: int(card["groups"][name]) if card and name in card["groups"] else len(goal) for name in names}
     if "proprio" in sizes:
         sizes["proprio"] = 3 * len(moved)
-    if felt is not None:
-        observation = sensed.groups[felt.group].observation
-        sizes[GROUP] = sum(term.num_features for term in sensed.touch.plan.observations if term.group == observation)
-    result = Prepared(saved, loaded, sensed, felt, sizes, tuple(goal) or None, model, actuators, changes)
+    if touch is not None:
+        observation = sensors.groups[touch.group].observation
+        sizes[GROUP] = sum(term.num_features for term in sensors.touch.plan.observations if term.group == observation)
+    result = Prepared(saved, loaded, sensors, touch, sizes, tuple(goal) or None, model, actuators, changes)
     result.policy()
     return result
 
@@ -228,7 +228,7 @@ class Hand:
         sizes = {"qpos": model.nq, "qvel": model.nv, "ctrl": model.nu, "qfrc_applied": model.nv}
         self._arrays = {name: torch.zeros((1, size), dtype=torch.float64) for name, size in sizes.items()}
         self._actuation = Actuation(prepared.moved, self._arrays, spec.action, DriveSpec(), Draws(0, 1))
-        self._joints = prepared.sensed.touch.inputs.joints  # as the groups `joint_pos` and `joint_vel` have them
+        self._joints = prepared.sensors.touch.inputs.joints  # as the groups `joint_pos` and `joint_vel` have them
         self._rows = torch.tensor([self._joints.index(name) for name in prepared.moved.names])
         self._goal = torch.tensor([prepared.goal or ()], dtype=torch.float64)
         self._measures = is_exact and spec.joint_vel == "measured"
@@ -280,8 +280,8 @@ class Hand:
             goal=self._goal if self._scene is None else self._scene.goal,
         )
         result = {"proprio": groups.proprio(now, spec.proprio.vel_scale)} | prepared.loaded.task.observe_hand(spec, now)
-        if prepared.felt is not None:
-            result[GROUP] = observed[prepared.sensed.groups[prepared.felt.group].observation].cpu()
+        if prepared.touch is not None:
+            result[GROUP] = observed[prepared.sensors.groups[prepared.touch.group].observation].cpu()
         return {name: result[name].float() for name in prepared.groups}
 
     def step(self, action: Float[Tensor, "env joint"]) -> Step:

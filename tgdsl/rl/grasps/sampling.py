@@ -37,7 +37,7 @@ from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.grasps.grasps import Grasps, GraspSpec, GraspTable, cache_key, grasp_spec, read_grasps, settings_of
 from tgdsl.rl.load import LoadedTask
-from tgdsl.rl.sensed import Sensed, compile_sensed
+from tgdsl.rl.sensors import TaskSensors, compile_sensors
 from tgdsl.rl.start import make_simulation, moved_joints
 from tgdsl.rl.task import Setup
 from tgdsl.runtime.batch.simulation import BatchSimulation
@@ -55,9 +55,9 @@ Count = Callable[[int, int], None]  # called with the number of grasps so far an
 
 def sample(loaded: LoadedTask, count: Count, progress: Progress | None = None) -> Grasps:
     """Sample a task's grasps, on the CPU."""
-    spec, sensed = grasp_spec(loaded.spec), compile_sensed(loaded, "cpu", progress, only=("link_contact",))
+    spec, sensors = grasp_spec(loaded.spec), compile_sensors(loaded, "cpu", progress, only=("link_contact",))
     assert spec is not None
-    trials = _Trials(loaded, sensed, spec)
+    trials = _Trials(loaded, sensors, spec)
     num = trials.num_variants
     requested = torch.tensor([spec.num // num + (v < spec.num % num) for v in range(num)])
     accepted, rounds, trials_of = torch.zeros_like(requested), [], torch.bincount(trials.variant)
@@ -78,7 +78,7 @@ def sample(loaded: LoadedTask, count: Count, progress: Progress | None = None) -
         qpos=qpos[ids].numpy(),
         ctrl=ctrl[ids].numpy(),
         variant=variant[ids].numpy(),
-        scene=scene_digest(sensed.touch.plan.scene),
+        scene=scene_digest(sensors.touch.plan.scene),
         object=loaded.spec.object,
         settings=settings_of(loaded.spec, trials.joints),
     )
@@ -87,12 +87,12 @@ def sample(loaded: LoadedTask, count: Count, progress: Progress | None = None) -
 class _Trials:
     """Trials side by side, one per environment."""
 
-    def __init__(self, loaded: LoadedTask, sensed: Sensed, spec: GraspSpec):
-        inputs, task = sensed.touch.inputs, loaded.spec
-        self.spec, self.joints = spec, moved_joints(loaded, sensed)
-        self.num_variants = sensed.num_variants(task.object)
+    def __init__(self, loaded: LoadedTask, sensors: TaskSensors, spec: GraspSpec):
+        inputs, task = sensors.touch.inputs, loaded.spec
+        self.spec, self.joints = spec, moved_joints(loaded, sensors)
+        self.num_variants = sensors.num_variants(task.object)
         num_envs = max(self.num_variants, min(SIDE_BY_SIDE, 2 * spec.num))
-        sim = make_simulation(loaded, sensed, self.joints, num_envs, "cpu", "mujoco")
+        sim = make_simulation(loaded, sensors, self.joints, num_envs, "cpu", "mujoco")
         assert isinstance(sim, BatchSimulation)
         self.sim, model = sim, sim.model
         self.variant: Int[Tensor, " env"] = torch.arange(num_envs) % self.num_variants
@@ -108,8 +108,8 @@ class _Trials:
         self._spread = (SHARE * (self._high - self._low)).clamp(max=spec.spread)
         self._closed = torch.from_numpy(model.key_ctrl[closed])[self._actuator]
         self._open, self._ctrl = sim.qpos[0].clone(), sim.ctrl[0].clone()
-        self._body = sensed.object
-        self._place = _Place(loaded, spec, model, sensed.object)
+        self._body = sensors.object
+        self._place = _Place(loaded, spec, model, sensors.object)
         self._pairs = [i for i, pair in enumerate(inputs.pairs) if pair.object == task.object]
         self._draws = Draws(spec.seed, num_envs)
         self._failed = dict.fromkeys(("diverged", "tilted", "moved away", "held by too few links or from one side"), 0)

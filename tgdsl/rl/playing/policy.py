@@ -40,7 +40,7 @@ from tgdsl.module.taxels import HasPlan, check_taxels, plan_tables
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.playing.rollout import Actor
-from tgdsl.rl.sensed import GROUP, sensors_document
+from tgdsl.rl.sensors import GROUP, sensors_document
 from tgdsl.rl.spec import TaskSpec
 
 ELSEWHERE = {"tgdsl", "robot", "scene", "resolution", "observations"}
@@ -289,9 +289,9 @@ def policy_for(env: TouchEnv, saved: PolicyFile, named: Sequence[str] = ()) -> P
     if card is not None:
         check_learned(card, file, env.spec)
         check_card(saved, env.joint_names, env.touch)
-        felt = card["spec"].get("touch", env.spec.touch)
-        if GROUP in card["groups"] and felt != env.spec.touch:
-            raise PolicyError(f"{file}: this policy feels {felt}, not {env.spec.touch}; try --set touch={felt}")
+        touch = card["spec"].get("touch", env.spec.touch)
+        if GROUP in card["groups"] and touch != env.spec.touch:
+            raise PolicyError(f"{file}: this policy feels {touch}, not {env.spec.touch}; try --set touch={touch}")
     groups = {name: env.groups[name] for name in actor_groups(env.groups, named, card)}
     policy = Policy(saved, groups, env.num_envs, env.num_actions, env.device)
     if card is not None:
@@ -329,7 +329,7 @@ def _summands(groups: Mapping[str, int]) -> str:
 
 
 def _is_in_order(card: Mapping[str, int], groups: Mapping[str, int]) -> bool:
-    """Whether groups equal a card's, in its order; the touch group may have the name of `Felt.group`."""
+    """Whether groups equal a card's, in its order; the touch group may have the name of `PolicyTouch.group`."""
     pairs = zip(card.items(), groups.items(), strict=False)
     return len(card) == len(groups) and all(
         size == result and (name == other or (name == GROUP and other.startswith(f"{GROUP}/")))

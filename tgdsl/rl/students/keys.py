@@ -28,7 +28,7 @@ from tgdsl.rl.playing.policy import (
     check_learned,
     read_policy,
 )
-from tgdsl.rl.sensed import GROUP, Felt, compile_sensed
+from tgdsl.rl.sensors import GROUP, PolicyTouch, compile_sensors
 from tgdsl.rl.spec import PushSpec, touch_types
 from tgdsl.rl.students.spec import StudentNetworksSpec
 from tgdsl.rl.students.student import Architecture, Encoder, Grid
@@ -44,13 +44,13 @@ class StudentError(TgdslError):
 class StudentKey:
     """A student: its touch (None: without), and the seed of its initial weights."""
 
-    felt: Felt | None
+    touch: PolicyTouch | None
     seed: int
 
     @property
     def kind(self) -> tuple[str, str, str]:
         """Type, placement and noise; the latter two are empty without touch."""
-        return (NONE, "", "") if self.felt is None else (self.felt.type, self.felt.placement, self.felt.noise)
+        return (NONE, "", "") if self.touch is None else (self.touch.type, self.touch.placement, self.touch.noise)
 
     @property
     def name(self) -> str:
@@ -72,23 +72,23 @@ def student_keys(types: Sequence[str], placements: Sequence[str], noises: Sequen
             raise StudentError(f"{option}: expected one at least")
     if seeds < 1:
         raise StudentError(f"{seeds} seeds, expected 1 at least")
-    felts = [
-        None if type_ == NONE else Felt(type_, placement, noise)
+    touches = [
+        None if type_ == NONE else PolicyTouch(type_, placement, noise)
         for type_ in selected
         for placement in placements
         for noise in noises
     ]
     keys = {}
-    for key in (StudentKey(felt, seed) for felt in dict.fromkeys(felts) for seed in range(seeds)):
+    for key in (StudentKey(touch, seed) for touch in dict.fromkeys(touches) for seed in range(seeds)):
         if (other := keys.setdefault(key.name, key)) is not key:
             both = " and ".join(" ".join(part for part in each.kind if part) for each in (other, key))
             raise StudentError(f"two students would have the name {key.name}: {both}")
     return list(keys.values())
 
 
-def feels(dealt: Sequence[StudentKey], also: Felt | None = None) -> list[Felt]:
+def touches(dealt: Sequence[StudentKey], also: PolicyTouch | None = None) -> list[PolicyTouch]:
     """Return the touch of all students and a teacher (`also`), each once."""
-    return list(dict.fromkeys(felt for felt in (*(key.felt for key in dealt), also) if felt is not None))
+    return list(dict.fromkeys(touch for touch in (*(key.touch for key in dealt), also) if touch is not None))
 
 
 def check_blocks(num_envs: int, num_students: int, num_variants: int) -> None:
@@ -114,7 +114,7 @@ def groups_of(loaded: LoadedTask, groups: Mapping[str, int]) -> list[str]:
 
 def seen_by(key: StudentKey, names: Sequence[str]) -> list[str]:
     """Return the groups of observations that a student sees, in their order."""
-    touch_group = [key.felt.group] if key.felt else []
+    touch_group = [key.touch.group] if key.touch else []
     return [group for name in names for group in (touch_group if name == GROUP else [name])]
 
 
@@ -123,8 +123,8 @@ def architecture(loaded: LoadedTask, env: TouchEnv, key: StudentKey, names: Sequ
     networks, parts = loaded.spec.distill.networks, []
     for name in seen_by(key, names):
         size = env.groups[name]
-        if key.felt is not None and name == key.felt.group:
-            encoder = _touch_encoder(networks, key.felt, env.felt[name].layout, size)
+        if key.touch is not None and name == key.touch.group:
+            encoder = _touch_encoder(networks, key.touch, env.touch_sources[name].layout, size)
         else:
             encoder = Encoder(networks.kind, networks.encoder.hidden, networks.encoder.size)
         parts.append((size, encoder))
@@ -132,24 +132,24 @@ def architecture(loaded: LoadedTask, env: TouchEnv, key: StudentKey, names: Sequ
     return Architecture(tuple(parts), networks.hidden, env.num_actions, heads, networks.eps, networks.clip)
 
 
-def _touch_encoder(networks: StudentNetworksSpec, felt: Felt, layout: Layout, size: int) -> Encoder:
+def _touch_encoder(networks: StudentNetworksSpec, touch: PolicyTouch, layout: Layout, size: int) -> Encoder:
     widths, kind = networks.touch_encoder, networks.touch_kind
-    if kind in ("cnn", "convrnn") and not felt.is_per_link and layout.num_taxels and size % layout.num_taxels == 0:
+    if kind in ("cnn", "convrnn") and not touch.is_per_link and layout.num_taxels and size % layout.num_taxels == 0:
         return Encoder(
-            kind, networks.convolution.channels, widths.size, networks.convolution.kernel, grid_of(layout, size, felt)
+            kind, networks.convolution.channels, widths.size, networks.convolution.kernel, grid_of(layout, size, touch)
         )
     return Encoder("lstm" if kind in ("lstm", "convrnn") else "mlp", widths.hidden, widths.size)
 
 
-def grid_of(layout: Layout, size: int, felt: Felt) -> Grid:
+def grid_of(layout: Layout, size: int, touch: PolicyTouch) -> Grid:
     """Return the places of a group's taxels in images; raise `StudentError` if a link's taxels are on no grid."""
     try:
         images = image_indices(layout)
     except TgdslError as error:
-        raise StudentError(f"{felt.group}: {error}; take networks.touch_kind mlp") from error
+        raise StudentError(f"{touch.group}: {error}; take networks.touch_kind mlp") from error
     if missing := [link.name for link in layout.links if link.name not in images]:
         problem = f"the taxels of {', '.join(missing)} are on no grid, and have no image"
-        raise StudentError(f"{felt.group}: {problem}; take networks.touch_kind mlp")
+        raise StudentError(f"{touch.group}: {problem}; take networks.touch_kind mlp")
     shape = (len(images), max(len(image) for image in images.values()), max(image.shape[1] for image in images.values()))
     cells = np.full(shape, -1, dtype=np.int64)
     for link, image in enumerate(images.values()):
@@ -161,7 +161,7 @@ WARM_CALLS = 3  # calls in which TorchScript optimises a policy before its captu
 
 
 class Teacher:
-    """A learned policy, checked against this task: its file, its card, and its touch (`felt`; None: without)."""
+    """A learned policy, checked against this task: its file, its card, and its touch (None: without)."""
 
     def __init__(self, file: Path, loaded: LoadedTask):
         """Read it, and check that it is for this task and these actions."""
@@ -171,11 +171,11 @@ class Teacher:
             raise PolicyError(f"{file}: this policy has no card that says how it was learned, as `tgdsl train` writes it")
         check_learned(card, file, loaded.spec, "teacher")
         self.card, theirs, ours = card, card["spec"], loaded.spec.model_dump(mode="json")
-        self.felt = Felt(theirs["touch"], theirs["placement"], theirs["noise"]) if GROUP in card["groups"] else None
-        if self.felt and theirs["resolution"] != ours["resolution"]:
+        self.touch = PolicyTouch(theirs["touch"], theirs["placement"], theirs["noise"]) if GROUP in card["groups"] else None
+        if self.touch and theirs["resolution"] != ours["resolution"]:
             resolutions = f"resolution {theirs['resolution']}, here {ours['resolution']}"
             raise PolicyError(f"{file}: this teacher feels with other taxels: {resolutions}")
-        if self.felt and theirs.get("temporal", "last") != ours["temporal"]:
+        if self.touch and theirs.get("temporal", "last") != ours["temporal"]:
             readings = f"temporal {theirs.get('temporal', 'last')}, here {ours['temporal']}"
             raise PolicyError(f"{file}: this teacher feels other readings of a control step: {readings}")
         if loaded.spec.distill.loss == "inverse_variance" and not card.get("std"):
@@ -185,8 +185,8 @@ class Teacher:
 
     def check_taxels(self) -> None:
         """Raise `PolicyError` if a teacher with touch was learned with other taxels."""
-        if self.felt is not None:
-            touch = compile_sensed(own_task(self._loaded, self.felt), "cpu").touch
+        if self.touch is not None:
+            touch = compile_sensors(own_task(self._loaded, self.touch), "cpu").touch
             check_card(self.saved, self.card["joints"], touch)
 
     def bound(self, env: TouchEnv) -> Policy:
@@ -197,7 +197,7 @@ class Teacher:
             raise PolicyError("{}: this teacher moves {}, not {}".format(file, *moved))
         groups = {}
         for name, size in card["groups"].items():
-            group = self.felt.group if name == GROUP and self.felt else name
+            group = self.touch.group if name == GROUP and self.touch else name
             if env.groups.get(group) != size:
                 there = f"has {env.groups[group]} numbers, not {size}: probes or objects are others"
                 problem = there if group in env.groups else "is not there"
@@ -219,7 +219,7 @@ def students_task(loaded: LoadedTask) -> LoadedTask:
     return dataclasses.replace(loaded, spec=loaded.spec.model_copy(update={"randomise": randomise}))
 
 
-def own_task(loaded: LoadedTask, felt: Felt | None) -> LoadedTask:
+def own_task(loaded: LoadedTask, touch: PolicyTouch | None) -> LoadedTask:
     """Return the task of a policy with one kind of touch, in separate environments."""
-    touch = {"touch": "none"} if felt is None else {"touch": felt.type, "placement": felt.placement, "noise": felt.noise}
+    touch = {"touch": "none"} if touch is None else {"touch": touch.type, "placement": touch.placement, "noise": touch.noise}
     return dataclasses.replace(loaded, spec=loaded.spec.model_copy(update=touch))

@@ -23,7 +23,7 @@ from tgdsl.files.write import atomic_write, with_folder
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.playing.evaluation import Evaluation
 from tgdsl.rl.playing.policy import card_texts, write_onnx_policy, write_policy
-from tgdsl.rl.sensed import GROUP, Felt, compile_sensed
+from tgdsl.rl.sensors import GROUP, PolicyTouch, compile_sensors
 from tgdsl.rl.students.keys import StudentKey, own_task
 from tgdsl.rl.students.learner import Distiller
 from tgdsl.rl.students.student import acting, deployed
@@ -108,14 +108,14 @@ def write_students(
 ) -> None:
     """Write each student as a policy file, with its card, for `tgdsl play --policy` and `tgdsl evaluate`."""
     with_folder(folder / "any")
-    alone: dict[Felt | None, Any] = {}
+    alone: dict[PolicyTouch | None, Any] = {}
     for i, key in enumerate(distiller.keys):
-        if key.felt not in alone:
+        if key.touch not in alone:
             progress(f"taxels of {key.name}")
-            alone[key.felt] = compile_sensed(own_task(loaded, key.felt), "cpu").touch
-        touch, names = alone[key.felt], distiller.groups[key.name]
-        sizes = {GROUP if key.felt and name == key.felt.group else name: distiller.env.groups[name] for name in names}
-        spec = own_task(loaded, key.felt).spec.model_dump(mode="json")
+            alone[key.touch] = compile_sensors(own_task(loaded, key.touch), "cpu").touch
+        touch, names = alone[key.touch], distiller.groups[key.name]
+        sizes = {GROUP if key.touch and name == key.touch.group else name: distiller.env.groups[name] for name in names}
+        spec = own_task(loaded, key.touch).spec.model_dump(mode="json")
         run = dict(origin) | {"spec": spec, "taxels": touch.taxels_id, "seed": key.seed}
         run["overrides"] = dict(origin["overrides"]) | {name: spec[name] for name in ("touch", "placement", "noise")}
         card = distiller.card(run, seconds, command, sizes)

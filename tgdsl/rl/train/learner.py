@@ -30,7 +30,7 @@ from tgdsl.rl.env import Step, TouchEnv
 from tgdsl.rl.load import LoadedTask, train_groups, wrong_groups
 from tgdsl.rl.playing.policy import card_texts, write_onnx_policy, write_policy
 from tgdsl.rl.playing.rollout import Actor, Moment, rollout
-from tgdsl.rl.sensed import GROUP
+from tgdsl.rl.sensors import GROUP
 from tgdsl.rl.train.ppo import LOSSES, CapturedPPO
 from tgdsl.rl.train.ranks import Ranks, add_up
 from tgdsl.tensors.env_ids import may_be_nonempty

@@ -42,7 +42,7 @@ KEYS: dict[str, Place] = {
 """A task's keys that override the sensors' document, by the document's key."""
 
 
-class Felt(NamedTuple):
+class PolicyTouch(NamedTuple):
     """Touch of a policy: a `TouchType` except "none", a link group or name with shell wildcards, and a noise profile."""
 
     type: str
@@ -86,11 +86,11 @@ class Source(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Sensed:
+class TaskSensors:
     """A task's sensors, and the names of their readings."""
 
     touch: TactileModule
-    felt: str | None  # name of the policy's sensor; None without touch
+    policy_sensor: str | None  # name of the policy's sensor; None without touch
     contact: str | None  # name of the `link_contact` sensor; None if the task takes none
     channels: tuple[str, ...]  # its channels: the force is among them, and the normal force if the task wants it
     distance: str | None  # name of the `surface_distance` sensor; None if the task takes none
@@ -121,19 +121,19 @@ class Sensed:
         return force, of_links[:, :, self.channels.index("normal_force")] if "normal_force" in self.channels else none
 
 
-def compile_sensed(
+def compile_sensors(
     loaded: LoadedTask,
     device: torch.device | str,
     progress: Progress | None = None,
     only: Sequence[str] | None = None,
-    feels: Sequence[Felt] | None = None,
+    touches: Sequence[PolicyTouch] | None = None,
     also: Mapping[str, Sequence[Mapping[str, Any]]] | None = None,
-) -> Sensed:
+) -> TaskSensors:
     """Compile a task's sensors."""
     spec, document = loaded.spec, sensors_document(loaded)
     senses = loaded.senses if only is None else only
     of_policy = [] if only is not None or spec.touch == "none" else [spec.touch]
-    types = of_policy if feels is None else [each.type for each in feels]
+    types = of_policy if touches is None else [each.type for each in touches]
     sensor = _sensors_of(loaded, document, {"task": senses, "touch": [touch_types()[type_][0] for type_ in types]})
     by_kind = {kind: sensor[kind] for kind in senses}
     overrides, observations = _sensor_overrides(loaded), dict[str, OfReading]()
@@ -143,14 +143,14 @@ def compile_sensed(
         overrides[f"objects.{spec.object}.variants"] = _variants(loaded, document)
     if spec.physics.collision is not None:
         overrides["robot.collision"] = spec.physics.collision
-    felt, felts = None, {each: sensor[each.kind] for each in feels or ()}
-    if feels is not None:
-        more, observations = _overrides(loaded, felts)
+    policy_sensor, sensor_of = None, {each: sensor[each.kind] for each in touches or ()}
+    if touches is not None:
+        more, observations = _overrides(loaded, sensor_of)
         overrides |= more
     elif of_policy:
-        felt = sensor[touch_types()[spec.touch][0]]
-        overrides |= {f"sensors.{felt}.links": spec.placement, f"sensors.{felt}.noise": spec.noise}
-        observations = {GROUP: _observation(spec.touch, felt)}
+        policy_sensor = sensor[touch_types()[spec.touch][0]]
+        overrides |= {f"sensors.{policy_sensor}.links": spec.placement, f"sensors.{policy_sensor}.noise": spec.noise}
+        observations = {GROUP: _observation(spec.touch, policy_sensor)}
     contact = by_kind.get("link_contact")
     if contact:
         outputs = document.spec.sensors[contact].outputs  # type: ignore[attr-defined]
@@ -158,7 +158,7 @@ def compile_sensed(
         overrides[f"sensors.{contact}.outputs"] = list(dict.fromkeys((*outputs, *forces)))
     observed = {name: [observation.model_dump(exclude_unset=True)] for name, observation in observations.items()}
     overrides = {"observations": observed | dict(also or {})} | overrides
-    with _mistakes_at_keys(loaded, of_several=feels is not None):
+    with _mistakes_at_keys(loaded, of_several=touches is not None):
         touch = compile_document(
             loaded.folder / spec.document,
             sensors=set(sensor.values()) or None,
@@ -168,13 +168,14 @@ def compile_sensed(
         )
     layouts = {planned.name: touch.plan.layout_of(planned) for planned in touch.plan.sensors}
     groups = {
-        each.group: _source(loaded, touch, each, observations[each.observation], layouts[name]) for each, name in felts.items()
+        each.group: _source(loaded, touch, each, observations[each.observation], layouts[name])
+        for each, name in sensor_of.items()
     }
-    if felt:
-        groups[GROUP] = Source(GROUP, observations[GROUP], None, layouts[felt])
-    return Sensed(
+    if policy_sensor:
+        groups[GROUP] = Source(GROUP, observations[GROUP], None, layouts[policy_sensor])
+    return TaskSensors(
         touch=touch,
-        felt=felt,
+        policy_sensor=policy_sensor,
         contact=contact,
         channels=next((output.channels for output in touch.outputs if output.name == contact), ()),
         distance=by_kind.get("surface_distance"),
@@ -184,45 +185,45 @@ def compile_sensed(
     )
 
 
-def _overrides(loaded: LoadedTask, felts: Mapping[Felt, str]) -> tuple[dict[str, Any], dict[str, OfReading]]:
+def _overrides(loaded: LoadedTask, sensor_of: Mapping[PolicyTouch, str]) -> tuple[dict[str, Any], dict[str, OfReading]]:
     """Return overrides of the sensors' document for policies with different touch, and the module's observations."""
     result, observations = dict[str, Any](), dict[str, OfReading]()
-    for sensor in dict.fromkeys(felts.values()):
-        carried = [felt for felt, carrier in felts.items() if carrier == sensor]
-        noises = list(dict.fromkeys(felt.noise for felt in carried if felt.noise != CLEAN))
+    for sensor in dict.fromkeys(sensor_of.values()):
+        carried = [wanted for wanted, carrier in sensor_of.items() if carrier == sensor]
+        noises = list(dict.fromkeys(wanted.noise for wanted in carried if wanted.noise != CLEAN))
         if len(noises) > 1:
             problem = f"noise {listed(noises)} of one sensor in one simulation, expected at most one and {CLEAN}"
             raise loaded.error(("noise",), problem)
-        is_both = bool(noises) and any(felt.noise == CLEAN for felt in carried)
-        result[f"sensors.{sensor}.links"] = list(dict.fromkeys(felt.placement for felt in carried))
+        is_both = bool(noises) and any(wanted.noise == CLEAN for wanted in carried)
+        result[f"sensors.{sensor}.links"] = list(dict.fromkeys(wanted.placement for wanted in carried))
         result[f"sensors.{sensor}.noise"] = noises[0] if noises else CLEAN
         result[f"sensors.{sensor}.readout"] = "both" if is_both else "measured"
-        for felt in carried:
-            reading = f"{sensor}/clean" if is_both and felt.noise == CLEAN else sensor
-            observations[felt.observation] = _observation(felt.type, reading)
+        for wanted in carried:
+            reading = f"{sensor}/clean" if is_both and wanted.noise == CLEAN else sensor
+            observations[wanted.observation] = _observation(wanted.type, reading)
     return result, observations
 
 
-def _source(loaded: LoadedTask, touch: TactileModule, felt: Felt, spec: OfReading, layout: Layout) -> Source:
+def _source(loaded: LoadedTask, touch: TactileModule, wanted: PolicyTouch, spec: OfReading, layout: Layout) -> Source:
     """Return a group's source: the placement's taxels or links of the sensor."""
     links = [link.name for link in layout.links]
-    names = layout.groups.get(felt.placement) or tuple(matching(felt.placement, links))
+    names = layout.groups.get(wanted.placement) or tuple(matching(wanted.placement, links))
     if set(names) == set(links):
-        return Source(felt.observation, spec, None, layout)
+        return Source(wanted.observation, spec, None, layout)
     taxels = layout.taxels_of(names)
-    size = sum(term.num_features for term in touch.plan.observations if term.group == felt.observation)
-    rows = np.flatnonzero([name in names for name in links]) if felt.is_per_link else taxels
-    num_rows = len(links) if felt.is_per_link else layout.num_taxels
+    size = sum(term.num_features for term in touch.plan.observations if term.group == wanted.observation)
+    rows = np.flatnonzero([name in names for name in links]) if wanted.is_per_link else taxels
+    num_rows = len(links) if wanted.is_per_link else layout.num_taxels
     if not num_rows or size % num_rows:
-        problem = f'"{felt.type}" at {felt.placement} cannot share a sensor with other links: its numbers are not of taxels'
+        problem = f'"{wanted.type}" at {wanted.placement} cannot share a sensor with other links: its numbers are not of taxels'
         raise loaded.error(("placement",), problem)
     columns = (np.arange(size // num_rows)[:, None] * num_rows + rows).ravel()
-    return Source(felt.observation, spec, torch.from_numpy(columns).to(touch.device), layout.take(taxels))
+    return Source(wanted.observation, spec, torch.from_numpy(columns).to(touch.device), layout.take(taxels))
 
 
-def check_felt(loaded: LoadedTask, feels: Sequence[Felt]) -> None:
+def check_touch(loaded: LoadedTask, touches: Sequence[PolicyTouch]) -> None:
     """Raise `SpecError` if the sensors' document lacks a sensor for a policy's touch, or has mistakes."""
-    _sensors_of(loaded, sensors_document(loaded), {"touch": [each.kind for each in feels]})
+    _sensors_of(loaded, sensors_document(loaded), {"touch": [each.kind for each in touches]})
 
 
 def types_of(loaded: LoadedTask) -> list[str]:
@@ -329,22 +330,22 @@ def _sensors_of(loaded: LoadedTask, document: Loaded, wanted: Mapping[str, Seque
 class SubstepTouch:
     """The touch groups after each physics step of the last control step (`temporal: stack`); all equal at a start."""
 
-    def __init__(self, sensed: Sensed, sim: Simulation):
-        self._sensed, self._sim = sensed, sim
+    def __init__(self, sensors: TaskSensors, sim: Simulation):
+        self._sensors, self._sim = sensors, sim
         self.stacks: dict[str, Float[Tensor, "env step feature"]] = {}  # live tensors
 
     def step(self, control: Float[Tensor, "env nu"]) -> dict[str, Tensor]:
         """Make a control step with readings at each physics step; return the last ones."""
         readings: dict[str, Tensor] = {}
         for i, state in enumerate(self._sim.substates(control)):
-            readings = self._sensed.touch(state)
-            for name, value in self._sensed.observe(readings).items():
+            readings = self._sensors.touch(state)
+            for name, value in self._sensors.observe(readings).items():
                 self.stacks[name][:, i].copy_(value)
         return readings
 
     def begin(self, chosen: Bool[Tensor, " env"], readings: dict[str, Tensor]) -> None:
         """Fill the stacks of environments that begin an episode with the readings of their start."""
-        for name, value in self._sensed.observe(readings).items():
+        for name, value in self._sensors.observe(readings).items():
             start = value[:, None].expand(-1, self._sim.substeps, -1)
             if name not in self.stacks:
                 self.stacks[name] = start.clone()
