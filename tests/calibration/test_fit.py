@@ -1,5 +1,7 @@
 """Fits to recordings made with known parameters: values, clocks, intervals, warnings, and the fitted document."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -135,13 +137,44 @@ def test_values_that_exclude_each_other_are_infeasible(path):
         ("touch.stiffness", 'there is no field "stiffness"'),
         ("touch.feels", "no number that can be fitted"),
         ("touch.friction_cone", "the document gives no value"),
-        ("touch.normal_stiffness=1", "expected a range such as"),
-        ("touch.normal_stiffness=600:900", "the document's value 500 is out of the range"),
+        ("touch.normal_stiffness=1", "expected a range such as touch.normal_stiffness=500:1000"),
+        ("touch.normal_stiffness = 600:900", "the document's value 500 is out of the range 600 to 900"),
     ],
 )
 def test_parameters_that_cannot_be_fitted_are_refused(path, fit, message):
     with pytest.raises(TgdslError, match=message):
         Model(path, [fit])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"hold_out": "block"}, 'hold_out: found "block"; did you mean "blocks"?'),
+        ({"reading": "ofset"}, 'reading: found "ofset"; did you mean "offset"?'),
+        ({"reading": {"touch": "ofset"}}, 'reading: found "ofset"; did you mean "offset"?'),
+        ({"intervals": "profil"}, 'intervals: found "profil"; did you mean "profile"?'),
+        ({"hold_out": "recording"}, "hold_out: recording: there is one recording, expected several; or blocks, taxel or time"),
+    ],
+)
+def test_unknown_options_are_refused(path, options, message):
+    with pytest.raises(TgdslError, match=re.escape(message)):
+        tgdsl.calibrate(path, recording(path), ["touch.normal_stiffness"], starts=1, **options)
+
+
+def test_the_document_itself_is_not_overwritten(path):
+    fit = tgdsl.calibrate(path, recording(path), ["touch.normal_stiffness"], starts=1)
+    before = path.read_bytes()
+    with pytest.raises(TgdslError, match="this is the document that the fit began with"):
+        fit.document(path)
+    assert path.read_bytes() == before
+
+
+def test_a_sensor_that_nothing_touches_is_named(path):
+    """Poses in millimetres put the ball far from the pad."""
+    arrays = recording(path)
+    far = arrays | {"body_pos": 1e3 * arrays["body_pos"]}
+    fit = tgdsl.calibrate(path, far, ["touch.normal_stiffness"], starts=1, intervals="none")
+    assert any("the sensors read 0 in all samples" in text for text in fit.warnings), fit.warnings
 
 
 def test_a_fit_needs_a_recording(path):

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import Field
@@ -26,7 +26,7 @@ from tgdsl.calibration.recordings import Arrays, Recording, load_recording
 from tgdsl.compiler.pipeline import Document
 from tgdsl.console.progress import Progress, silent
 from tgdsl.console.tables import text_table
-from tgdsl.errors import TgdslError
+from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.fields.models import SpecModel
 from tgdsl.files.write import atomic_write
 from tgdsl.module.module import TactileModule
@@ -92,7 +92,8 @@ class Fit:
         """Write the document with the fitted values and its comments; return its path.
 
         Raises:
-            TgdslError: If the document is a mapping, or the file would be in another folder, where its paths are wrong.
+            TgdslError: If the document is a mapping; if the file is that document, or would be in another folder, where its
+                paths are wrong.
         """
         source = self.problem.model.document
         if isinstance(source, Mapping):
@@ -102,6 +103,8 @@ class Fit:
             for f in self.parameters.values()
         }
         out = Path(path)
+        if out.resolve() == Path(source).resolve():
+            raise TgdslError(f"{out}: this is the document that the fit began with; expected another file")
         if out.resolve().parent != Path(source).resolve().parent:
             raise TgdslError(f"{out}: file names in {source} are relative to its folder; write the fitted document there")
         atomic_write(out, with_values(Path(source), values).encode())
@@ -151,6 +154,16 @@ def calibrate(
         SpecError: All mistakes in the document, or in a recording, by its keys.
         TgdslError: If a parameter does not exist or is no number, or there are fewer numbers than unknowns.
     """
+    maps = [
+        ("reading", value, get_args(ReadingMap)) for value in (reading.values() if isinstance(reading, Mapping) else [reading])
+    ]
+    for name, value, choices in (
+        *maps,
+        ("hold_out", hold_out, get_args(HoldOut)),
+        ("intervals", intervals, get_args(Intervals)),
+    ):
+        if value not in choices:
+            raise TgdslError(f'{name}: found "{value}"; {did_you_mean(str(value), choices, "values")}')
     progress("compiling")
     model = Model(document, fit, overrides, kinds)
     sources = [recordings] if isinstance(recordings, (str, Path, Mapping)) else list(recordings)
@@ -161,6 +174,8 @@ def calibrate(
     problem = Problem(model, loaded, reading, gain)
     if hold_out in ("taxel", "blocks") and all(part.target.value.shape[1] == 1 for part in problem.parts):
         raise TgdslError(f"hold_out: {hold_out}: each target has one row; expected time or recording")
+    if hold_out == "recording" and len(loaded) == 1:
+        raise TgdslError("hold_out: recording: there is one recording, expected several; or blocks, taxel or time")
     solution = _best(problem, starts, seed, robust, progress)
     out = None if hold_out == "none" else checks.held_out(problem, solution, hold_out, folds, seed, progress)
     uncertainty = checks.uncertainty(problem, solution)
@@ -261,7 +276,11 @@ def _warnings(
     for j, each in enumerate(fitted):
         parameter, u = each.parameter, solution.x[j]
         if np.isinf(uncertainty.sigma[j]):
-            notes.append(f"{each.path}: no reading depends on it; leave it out")
+            is_silent = not any(part.any() for part in problem.predicted(solution.x))
+            hint = (
+                "the sensors read 0 in all samples: does an object touch them? Poses are in m" if is_silent else "leave it out"
+            )
+            notes.append(f"{each.path}: no reading depends on it; {hint}")
         elif not each.is_identified:
             notes.append(f"{each.path}: the data do not tell it: 95 % are {each.low:.4g} to {each.high:.4g} {parameter.unit}")
         if min(u, 1 - u) < 1e-3:

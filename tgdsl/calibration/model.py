@@ -176,7 +176,7 @@ class Model:
             raise InfeasibleError(str(error.errors()[0]["msg"])) from error
 
     def _parameter(self, text: str) -> Parameter:
-        path, _, span = text.partition("=")
+        path, span = (part.strip() for part in text.partition("=")[::2])
         sensor, *fields = path.split(".")
         specs = self._loaded.spec.sensors
         if sensor not in specs or not fields:
@@ -210,17 +210,17 @@ def _rows(reading: torch.Tensor) -> np.ndarray:
 def _bounded(path: str, start: float, quantity: Quantity, usual: Usual | None, span: str, unit: str) -> Parameter:
     """Return a parameter with the user's bounds, or with bounds from its field."""
     least = next((bound for bound in (quantity.ge, quantity.gt) if bound is not None), -math.inf)
-    most = math.inf if quantity.le is None else quantity.le
+    most, of_unit = math.inf if quantity.le is None else quantity.le, f" {unit}" if unit else ""
     if span:
         parts = span.split(":")
         if len(parts) != 2:
-            raise TgdslError(f"{path}={span}: expected a range such as {path}=1:9")
+            raise TgdslError(f"{path}={span}: expected a range such as {path}={start:g}{of_unit}:{2 * start or 1:g}{of_unit}")
         try:
             low, high = (units.parse(part, quantity.dimension) for part in parts)
         except ValueError as error:
             raise TgdslError(f"{path}={span}: {error}") from error
         if not (least <= low < high <= most) or (low == 0 and quantity.gt == 0):
-            raise TgdslError(f"{path}={span}: expected a range within {least:g} to {most:g}")
+            raise TgdslError(f"{path}={span}: expected a range within {least:g} to {most:g}{of_unit}")
     else:
         usual_high = usual.high if usual is not None else math.inf
         reach = 10**DECADES * (abs(start) or 1.0)
@@ -229,7 +229,7 @@ def _bounded(path: str, start: float, quantity: Quantity, usual: Usual | None, s
         if quantity.gt == 0:
             low = min(max(usual.low if usual is not None else 0.0, start / 10**DECADES), start)
     if not low <= start <= high:
-        raise TgdslError(f"{path}: the document's value {start:g} is out of the range {low:g} to {high:g}")
+        raise TgdslError(f"{path}: the document's value {start:g}{of_unit} is out of the range {low:g} to {high:g}{of_unit}")
     return Parameter(path, start, low, high, unit, is_log=low > 0 and high / low > LOGARITHMIC)
 
 

@@ -261,6 +261,8 @@ class _Reader:
             hint = (
                 f'if they are sums of all rows, set rows:{name} to "sum"' if value.shape == (*shape[:1], 1, *shape[2:]) else ""
             )
+            if not hint and value.shape[:-1] == shape[:-1] and f"channels:{name}" not in self.arrays:
+                hint = f"name those that it has in channels:{name}"
             self.note(key, f"found shape {value.shape}, expected {shape}: samples, {', '.join(axes)}, channels", hint)
             return None
         try:
@@ -314,7 +316,7 @@ class _Reader:
             hint = f'the reading is in {unit}: expected "{unit}" or one like it'
             self.note(key, "the unit of the target is missing", hint)
         else:
-            hint = f"expected one of {', '.join(factors) or unit}"
+            hint = f"expected one of {', '.join(factors) or unit}, and numbers in it"
             self.note(key, f'"{written}" is no unit of this reading, which is in {unit}', hint)
         return 1.0, unit
 
