@@ -117,6 +117,15 @@ def test_a_resumed_run_keeps_its_overrides_and_prints_changes(base, here):
     assert from_where == [[None, "a run"], "a run"]
 
 
+def test_a_run_starts_from_the_policy_of_another(base, here, fails):
+    start = ["train", "task.yaml", *ON, "--episodes", "0", *ARGUMENTS, "--iterations", "1"]
+    assert here(base, *start, "--out", "first")[0] == 0
+    code, _, error = here(base, *start, "--init", "first", "--out", "second")
+    assert code == 0, error
+    assert _starts(base / "second", "starts_from") == ["first/policy.pt"]
+    assert "found both --init and --resume" in fails(*start, "--init", "first", "--resume", "first")
+
+
 def _starts(folder, name):
     return [entry[name] for entry in json.loads((folder / "run.json").read_text())["starts"]]
 

@@ -16,6 +16,7 @@ from tgdsl.errors import TgdslError
 
 if TYPE_CHECKING:
     from tgdsl.rl.load import LoadedTask
+    from tgdsl.rl.playing.policy import PolicyFile
     from tgdsl.rl.playing.rollout import Moment
     from tgdsl.rl.train.folder import RunFolder
     from tgdsl.rl.train.learner import Learner
@@ -45,6 +46,9 @@ class Train:
     resume: args.OptionalFolder = None
     """Folder of an earlier run to continue from its last checkpoint, with its overrides; default: a new run. With another
     --out, a new run starts from that checkpoint, with the overrides of this command only."""
+    init: args.OptionalFile = None
+    """A policy, or the folder of its run, whose weights and deviations the new run starts from: a teacher's or a student's. The
+    critic starts from scratch, and learns alone in the first 25 iterations."""
     out: args.OptionalOutFolder = None
     """Folder of the run; default: out/NAME, by the document's name, or the folder of the resumed run."""
     episodes: int = 1000
@@ -60,6 +64,7 @@ class Train:
             import tgdsl.rl.train.learner  # noqa: F401
         except ImportError as error:
             raise TgdslError(f'to learn needs rsl-rl-lib, and what that needs: pip install "tgdsl[rl]" ({error})') from error
+        from tgdsl.rl.playing.policy import read_policy
         from tgdsl.rl.train.folder import RunFolder, read_checkpoint
         from tgdsl.rl.train.ranks import Ranks
 
@@ -72,6 +77,11 @@ class Train:
         is_same = source is not None and folder.path.resolve() == source.path.resolve()
         overrides = args.joined_overrides(last_start.get("overrides", {}) if is_same else {}, args.parsed_overrides(self.set))
         loaded = load_task(self.task, overrides)
+        if self.init is not None and self.resume is not None:
+            raise TgdslError(
+                "found both --init and --resume, expected one: --resume goes on from a checkpoint, with its critic"
+            )
+        start = read_policy(self.init) if self.init is not None else None
         args.check_least(self, envs=1, iterations=1, minutes=0.0, episodes=0)
         with folder.lock() if ranks.is_first else nullcontext():
             if ranks.is_first:
@@ -79,7 +89,7 @@ class Train:
             state = read_checkpoint(source.checkpoint) if source else None
             ranks.join(device)
             try:
-                self._learn(loaded, folder, ranks, device, overrides, last_start, state)
+                self._learn(loaded, folder, ranks, device, overrides, last_start, state, start)
             finally:
                 ranks.leave()
 
@@ -92,6 +102,7 @@ class Train:
         overrides: dict[str, Any],
         before: dict[str, Any],
         state: dict[str, Any] | None,
+        start: PolicyFile | None,
     ) -> None:
         from tgdsl.rl.env import TouchEnv
         from tgdsl.rl.train.folder import changes, run_origin
@@ -107,7 +118,11 @@ class Train:
             if state is not None and self.resume is not None:
                 restore(learner, state, self.resume / "checkpoint.pt")
                 learner.change_rates(before.get("spec", {}).get("train", {}))
+            if start is not None:
+                learner.start_from(start)
             origin = run_origin(loaded, env, seed, overrides, ranks.size)
+            if start is not None:
+                origin["starts_from"] = str(start.file)
             if self.resume is not None:
                 origin["goes_on_from"] = str(self.resume)
             if ranks.is_first:

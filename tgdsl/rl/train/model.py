@@ -10,6 +10,7 @@ Shapes: `env` environments, `feature` numbers of all groups of a model, side by 
 from __future__ import annotations
 
 import copy
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -181,6 +182,20 @@ class Exported(nn.Module):
         """Return example inputs."""
         first = next(self.parameters())
         return (torch.zeros((2, self.model.obs_dim), dtype=first.dtype, device=first.device),)
+
+
+def actor_weights(policy: nn.Module) -> dict[str, Tensor]:
+    """Return the weights of a policy's TorchScript by their names in an `EncodedModel`, a student's too."""
+    result = {}
+    for name, value in policy.state_dict().items():
+        name = re.sub(r"^student\.encoders\.(\d+)\.layers\.", r"encoders.\1.", name.removeprefix("model."))
+        result[re.sub(r"^student\.trunk\.", "mlp.", name)] = value
+    for name in ("mean", "var"):
+        if f"student.{name}" in result:
+            result[f"obs_normalizer._{name}"] = result.pop(f"student.{name}")[None]
+    if "obs_normalizer._var" in result:
+        result.setdefault("obs_normalizer._std", result["obs_normalizer._var"].sqrt())
+    return result
 
 
 class Distillation(RandomNetworkDistillation):
