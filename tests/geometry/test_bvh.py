@@ -4,7 +4,6 @@ import copy
 import gc
 import pickle
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -259,10 +258,7 @@ def test_many_points():
     vertices, faces = icosphere(5)
     mesh = TriangleMesh(vertices, faces)
     points = 0.04 * np.random.default_rng(0).normal(size=(20_000, 3))
-    ask(mesh, points[:1])
-    start = time.process_time()
     distance, _ = ask(mesh, points, dtype=torch.float32)
-    assert time.process_time() - start < 2
     np.testing.assert_allclose(distance, np.linalg.norm(points, axis=1) - 0.05, rtol=0, atol=5e-5)  # facets
 
 

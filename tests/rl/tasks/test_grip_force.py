@@ -176,7 +176,7 @@ def test_force_taxels_carry_the_weight():
     env = grip(touch="force_taxel", resolution="low", force=["7 N", "7 N"], randomise__friction=[1.5, 1.5])
     for _ in range(20):
         env.step(zero_actions(env))
-    load = env._sensed.felt
+    load = env._sensors.policy_sensor
     readings, taxels = env.now.readings[load].double(), env.touch.taxels[load]
     bodies = list(dict.fromkeys(taxels["link"]))
     total = torch.zeros(NUM, 3, dtype=torch.float64)
@@ -200,7 +200,7 @@ def test_groups_of_observations(env):
     links = len(env.task.setup.links)
     assert env.groups == {
         "proprio": 24, "priv_proprio": 24 + 3 * links, "goal": 1, "priv_force": 1 + links, "priv_obj_state": 15,
-        "priv_obj_props": 2 + len(env.touch.rows[env._sensed.distance]["link"]),
+        "priv_obj_props": 2 + len(env.touch.rows[env._sensors.distance]["link"]),
     }  # fmt: skip
     torch.testing.assert_close(obs["goal"][:, 0].double(), env.task.command, rtol=1e-6, atol=0)
     torch.testing.assert_close(obs["priv_obj_props"][:, 1].double(), env.task.setup.mass, rtol=1e-6, atol=0)

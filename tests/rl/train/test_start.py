@@ -78,7 +78,7 @@ def student_file(learner, loaded, folder):
     torch.manual_seed(0)
     student = Student(Architecture(encoders, (8,), learner.env.num_actions))
     student.mean.normal_()
-    student.var.uniform_(0.01, 2.0)
+    student.var.uniform_(1e-6, 1e-4)
     card = learner.card(run_origin(loaded, learner.env, 0, {}, 1), 0.0, "a command") | {"std": None, "samples": 1000}
     write_policy(deployed(acting(student)), card_texts(learner.env.touch, card), folder / "student.pt")
     return read_policy(folder / "student.pt")
