@@ -301,22 +301,22 @@ def test_users_kinds_compile_and_load(document, tmp_path):
 
 
 TILES = {
-    "a depth": ({"kind": "contact_depth"}, True),
-    "a force": ({"kind": "force_taxel"}, True),
-    "two links": ({"kind": "contact_depth", "links": "all"}, False),
-    "noise": ({"kind": "contact_depth", "noise": {"white_noise": 1e-4}}, False),
-    "a velocity": ({"kind": "kinematic_taxel"}, False),
-    "moments": ({"kind": "proximity"}, False),
-    "frames": ({"kind": "elastomer"}, False),
+    "a depth": ({"kind": "contact_depth"}, True, False),
+    "a force": ({"kind": "force_taxel"}, True, True),
+    "two links": ({"kind": "contact_depth", "links": "all"}, False, False),
+    "noise": ({"kind": "contact_depth", "noise": {"white_noise": 1e-4}}, False, False),
+    "a velocity": ({"kind": "kinematic_taxel"}, False, False),
+    "moments": ({"kind": "proximity", "backend": "points", "points": 30}, False, False),
+    "frames": ({"kind": "elastomer"}, False, False),
 }
 
 
 @pytest.mark.parametrize("name", TILES)
 def test_sensors_with_little_work_per_taxel_use_tiles(document, name):
-    sensor, is_tiled = TILES[name]
+    sensor, is_tiled, is_tuned = TILES[name]
     document["sensors"] = {"mine": {"links": "pad", "feels": ["item"], **sensor}}
     options = tgdsl.compile(document).inductor_options()
-    tiles = {"triton.prefer_nd_tiling": is_tiled, "triton.enable_pdl": is_tiled, "coordinate_descent_tuning": is_tiled}
+    tiles = {"triton.prefer_nd_tiling": is_tiled, "triton.enable_pdl": is_tiled, "coordinate_descent_tuning": is_tuned}
     assert options == {"assert_indirect_indexing": False, "triton.autotune_pointwise": not is_tiled} | tiles
 
 

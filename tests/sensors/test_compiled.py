@@ -1,8 +1,13 @@
-"""One module of all kinds, with memory, in one compiled graph; `make test-full` compiles each kind with its noise alone."""
+"""One module of all kinds, with memory, in one compiled graph; `make test-full` compiles each kind with its noise alone.
 
+`make test` compiles up to the graphs of AOTAutograd, for which Inductor would write code for minutes.
+"""
+
+import pytest
 import torch
 from every_kind import SENSORS, every_kind
 from noisy_modules import FLOAT32_TOLERANCE, read
+from torch._dynamo.backends.registry import lookup_backend
 from torch._inductor.compile_fx import compile_fx
 from traced_graphs import number_inputs
 
@@ -15,7 +20,8 @@ NOISY = ("contact", "touch")
 """Sensors whose noise is compiled: bits with hysteresis, and all stages with a history."""
 
 
-def test_all_kinds_in_one_graph(tmp_path):
+@pytest.mark.parametrize("backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
+def test_all_kinds_in_one_graph(tmp_path, backend):
     """Compiled readings equal eager ones, over states with memory and a reset, at two numbers of environments.
 
     No number of the code or the plan is an input of the graph.
@@ -32,7 +38,9 @@ def test_all_kinds_in_one_graph(tmp_path):
 
     def code_of(graph, inputs):
         numbers.extend(number_inputs(graph))
-        return compile_fx(graph, inputs, config_patches=options)
+        if backend == "inductor":
+            return compile_fx(graph, inputs, config_patches=options)
+        return lookup_backend(backend)(graph, inputs)
 
     compiled.compile(backend=code_of)
     # 13 is no other size of the module: torch.compile takes equal sizes for one, and compiles again when they differ.

@@ -13,6 +13,7 @@ from torch import Tensor
 from tgdsl.module.state import CHOICES
 from tgdsl.plan.plan import Plan
 from tgdsl.quantities.base import Quantity
+from tgdsl.quantities.contacts import SLOT_FIELDS
 from tgdsl.tensors import torch_internals
 
 Tensors = dict[str, Tensor]
@@ -124,7 +125,7 @@ def inductor_options(plan: Plan, quantities: Sequence[Quantity], device: torch.d
     )
     is_fused = device.type == "cpu" and bool(quantities) and all(quantity.is_fused for quantity in quantities)
     checks_indices = any(name in plan.inputs.fields for name in CHOICES)
-    has_slots = any(name.startswith("contact_") for name in plan.inputs.fields)
+    has_slots = any(name in plan.inputs.fields for name in SLOT_FIELDS)
     return torch_internals.inductor_options(checks_indices, is_slight, has_slots, is_fused)
 
 
