@@ -59,11 +59,8 @@ def test_geometric_gates_need_no_colliders(tmp_path):
     """A taxel without colliders feels by distance; a buried one does not, because the cube stays out of the hull."""
     geometric = {**DEPTH, "gate": "geometric"}
     assert warnings_and_records(document(tmp_path, {"a": geometric}))[1] == [BURIED, INSIDE, THUMB]
-    assert warnings_and_records(document(tmp_path, {"a": {"kind": "proximity", "links": "*", "feels": ["cube"]}}))[1] == [
-        BURIED,
-        INSIDE,
-        THUMB,
-    ]
+    sums = {"kind": "proximity", "links": "*", "feels": ["cube"], "backend": "points", "points": 30}
+    assert warnings_and_records(document(tmp_path, {"a": sums}))[1] == [BURIED, INSIDE, THUMB]
     # One of the two sensors on the link cannot feel.
     mixed = {"a": geometric, "b": {**DEPTH, "links": ["the tip", "finger"]}}
     assert warnings_and_records(document(tmp_path, mixed))[1] == [BURIED, INSIDE, BARE, THUMB]

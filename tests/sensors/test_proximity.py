@@ -34,19 +34,19 @@ class TestProximity(KindConformance):
 
 class TestProximityWithSmoothGradients(KindConformance):
     kind = PROXIMITY
-    parameters = {"tolerance": 0.1, "gradient_tolerance": 0.3}
+    parameters = {"tolerance": 0.1, "gradient_tolerance": 0.3, "radius": 0.01}
     gates = ()
 
 
 class TestProximityOverPointsAsInThePaper(KindConformance):
     kind = PROXIMITY
-    parameters = {"backend": "points", "points": 600, "max_bytes": 2**22, "model": "paper", "torque_about": "link"}
+    parameters = {"backend": "points", "points": 300, "max_bytes": 2**22, "model": "paper", "torque_about": "link"}
     gates = ()
 
 
 class TestProximityOfOneRadius(KindConformance):
     kind = PROXIMITY
-    parameters = {"tolerance": 0.1, "radius": 0.006}
+    parameters = {"tolerance": 0.1, "radius": 0.01}
     test_compiled_equals_eager = None  # the same graph as `TestProximity`
     gates = ()
 
