@@ -1,6 +1,6 @@
 """One module of all kinds, with memory, in one compiled graph; `make test-full` compiles each kind with its noise alone.
 
-`make test` compiles up to the graphs of AOTAutograd, for which Inductor would write code for minutes.
+`make test` runs the graph that Dynamo traces, for which Inductor would write code for minutes.
 """
 
 import pytest
@@ -20,7 +20,7 @@ NOISY = ("contact", "touch")
 """Sensors whose noise is compiled: bits with hysteresis, and all stages with a history."""
 
 
-@pytest.mark.parametrize("backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", ["eager", pytest.param("inductor", marks=pytest.mark.slow)])
 def test_all_kinds_in_one_graph(tmp_path, backend):
     """Compiled readings equal eager ones, over states with memory and a reset, at two numbers of environments.
 
