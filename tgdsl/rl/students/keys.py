@@ -221,5 +221,5 @@ def students_task(loaded: LoadedTask) -> LoadedTask:
 
 def own_task(loaded: LoadedTask, touch: PolicyTouch | None) -> LoadedTask:
     """Return the task of a policy with one kind of touch, in separate environments."""
-    touch = {"touch": "none"} if touch is None else {"touch": touch.type, "placement": touch.placement, "noise": touch.noise}
-    return dataclasses.replace(loaded, spec=loaded.spec.model_copy(update=touch))
+    keys = {"touch": "none"} if touch is None else {"touch": touch.type, "placement": touch.placement, "noise": touch.noise}
+    return dataclasses.replace(loaded, spec=loaded.spec.model_copy(update=keys))
