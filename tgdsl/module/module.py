@@ -379,7 +379,7 @@ class TactileModule(HookedModule):
         self.memory.clock.seed_with(seed, first_env)
         return self
 
-    def compile(self, graph: bool = False, **options: Any) -> TactileModule:
+    def compile(self, graph: bool = False, **options: Any) -> TactileModule:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Compile calls and `peek` with `torch.compile` into fused kernels, in place, at the first call.
 
         Args:

@@ -32,7 +32,7 @@ def with_counts(load: ShearLoad) -> ShearLoad:
     pos, strength = (
         vec(torch.where(is_one, part.gather(-1, order), torch.nan) for part in planes) for planes in (load.pos, load.strength)
     )
-    return load._replace(pos=pos, strength=strength, count=count)
+    return load._replace(pos=pos, strength=strength, num_active=count)
 
 
 def main() -> None:

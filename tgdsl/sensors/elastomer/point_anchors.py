@@ -160,7 +160,7 @@ class ShearLoad(NamedTuple):
     pos: Vec  # z_p [m]
     strength: Vec  # (z_p − e_p) h_p [m²]
     # number of active points of each link, (env, link), which then come first; None: inactive ones have strength 0
-    count: Tensor | None = None
+    num_active: Tensor | None = None
 
 
 def shear_loads(
@@ -267,7 +267,7 @@ def point_sum(load: ShearLoad, markers: Markers) -> Vec:
 def _point_sum_by_kernel(load: ShearLoad, markers: Markers) -> Vec:
     from tgdsl.sensors.elastomer import point_sum_kernel
 
-    where = list(load.pos), list(load.strength), load.count, load.tiles, tile_size(load.taxels)
+    where = list(load.pos), list(load.strength), load.num_active, load.tiles, tile_size(load.taxels)
     result = point_sum_kernel.point_sum(*where, list(markers.pos), list(markers.normal), markers.falloff)
     return planes.vec(result.unbind())
 

@@ -183,7 +183,7 @@ def _at_centre(rows: Rows, patches: ContactPatch) -> Tensor:
     """Return 1 for the cell that holds each patch's centre, or is nearest (env, body, object, x, y, z)."""
     parts = []
     for axis, size in enumerate(num_cells(rows)):
-        corner, step, count = (part[axis][:, None] for part in (rows.boxes.corner, rows.boxes.step, rows.boxes.count))
+        corner, step, count = (part[axis][:, None] for part in (rows.boxes.corner, rows.boxes.step, rows.boxes.cells))
         place = torch.floor((patches.pos[axis].detach() - corner) / step).clamp(min=0.0)
         place = torch.minimum(place, count - 1.0)
         number = torch.arange(size, device=place.device, dtype=place.dtype)

@@ -75,7 +75,7 @@ def conductances(
     safe = torch.where(is_any, area, 1e-6)
     side, across, parts = torch.sqrt(safe), planes.vec((1.0 - n * n).clamp(min=0.0) for n in normal), []
     for a in range(3):
-        corner, step, count = (value[..., None] for value in (boxes.corner[a], boxes.step[a], boxes.count[a]))
+        corner, step, count = (value[..., None] for value in (boxes.corner[a], boxes.step[a], boxes.cells[a]))
         half = 0.5 * side * planes.safe_sqrt(across[a])
         parts.append(_along((pos[a] - corner) / step, half / step, count, num_cells[a]))
     within = parts[0].within * parts[1].within * parts[2].within

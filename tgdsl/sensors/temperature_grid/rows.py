@@ -24,7 +24,7 @@ class Boxes(NamedTuple):
     corner: Vec
     size: Vec
     step: Vec
-    count: Vec
+    cells: Vec
 
 
 class Rows(NamedTuple):
@@ -105,7 +105,7 @@ def is_there(rows: Rows) -> Tensor:
     parts = []
     for axis, size in enumerate(num_cells(rows)):
         place = torch.arange(size, device=rows.ends[0].device)
-        parts.append((place[None] < rows.boxes.count[axis][:, None]).to(rows.ends[0].dtype))
+        parts.append((place[None] < rows.boxes.cells[axis][:, None]).to(rows.ends[0].dtype))
     return of_cells(parts[0], 0) * of_cells(parts[1], 1) * of_cells(parts[2], 2)
 
 

@@ -57,20 +57,27 @@ def mesh(outline: list[Float[np.ndarray, "n 2"]], size: float) -> MeshTri:
             f"{MAX_CORNERS} are allowed",
             "give a smaller region, a larger thickness or less drag",
         )
-    for _ in range(BISECTIONS):
-        everything = np.concatenate([points, inner])
-        triangles = Delaunay(everything).simplices.astype(np.int64)
-        triangles = triangles[np.abs(igl.doublearea(everything, triangles)) > 1e-7]
-        triangulation = MeshTri(np.ascontiguousarray(everything.T), np.ascontiguousarray(triangles.T), sort_t=False)
+    triangulation = _triangulation(points, inner)
+    for _ in range(BISECTIONS - 1):
         missing = ~np.isin(_sides(pieces), _sides(np.asarray(triangulation.facets).T))
         if not missing.any():
             break
         points, pieces = _bisected(points, pieces, missing)
-    within = np.flatnonzero(_is_within(everything[triangles].mean(axis=1), points, pieces))
+        triangulation = _triangulation(points, inner)
+    middles = np.asarray(triangulation.p).T[np.asarray(triangulation.t).T].mean(axis=1)
+    within = np.flatnonzero(_is_within(middles, points, pieces))
     _check_edge(triangulation, within, pieces)
     inside = triangulation.restrict(within)
     assert isinstance(inside, MeshTri)
     return inside.scaled(size)
+
+
+def _triangulation(points: np.ndarray, inner: np.ndarray) -> MeshTri:
+    """Return Delaunay's triangulation of corners, without triangles that have no area."""
+    corners = np.concatenate([points, inner])
+    triangles = Delaunay(corners).simplices.astype(np.int64)
+    triangles = triangles[np.abs(igl.doublearea(corners, triangles)) > 1e-7]
+    return MeshTri(np.ascontiguousarray(corners.T), np.ascontiguousarray(triangles.T), sort_t=False)
 
 
 def _sides(ends: Int[np.ndarray, "seg 2"]) -> Int[np.ndarray, " seg"]:
