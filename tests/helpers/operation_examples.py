@@ -61,8 +61,8 @@ def shear_loads(found: tuple, arguments: tuple) -> list[Tensor]:
     _, _, state = arguments
     places = 0.003 * torch.tensor([[1.0, 0, 0], [0, 1, 0], [0.6, 0, 0.8]]).to(load.pos[0])
     markers = Markers(vec(places.T), vec((places / 0.003).T), places.new_tensor(2000.0), None)
-    if load.count is not None:  # those that load come first, and the rest means nothing
-        is_one = torch.arange(load.pos[0].shape[2], device=places.device) < load.count[..., None]
+    if load.num_active is not None:  # those that load come first, and the rest means nothing
+        is_one = torch.arange(load.pos[0].shape[2], device=places.device) < load.num_active[..., None]
         pos, strength = (vec(torch.where(is_one, part, 0.0) for part in parts) for parts in (load.pos, load.strength))
         load = load._replace(pos=pos, strength=strength, count=None)
     return [torch.stack(point_sum(load, markers)), *((after or state)[name] for name in PLANES)]

@@ -180,7 +180,7 @@ def test_without_a_kernel_torch_advances_all_objects(stick_slip):
         state = {name: plane[:, BEFORE:].double() for name, plane in free_state(meeting).items()}
         (load,), after = shear_loads([meeting], to_dtype(CONTACT_LAWS[stick_slip], torch.float64), state)
         (expected,), expected_state = advance([link_points(meeting)], to_dtype(CONTACT_LAWS[stick_slip], torch.float64), state)
-        assert load.count is None and all(torch.equal(after[name], expected_state[name]) for name in PLANES)
+        assert load.num_active is None and all(torch.equal(after[name], expected_state[name]) for name in PLANES)
         assert torch.equal(torch.stack(load.strength), torch.stack(expected.strength))
 
 
