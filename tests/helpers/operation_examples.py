@@ -64,7 +64,7 @@ def shear_loads(found: tuple, arguments: tuple) -> list[Tensor]:
     if load.num_active is not None:  # those that load come first, and the rest means nothing
         is_one = torch.arange(load.pos[0].shape[2], device=places.device) < load.num_active[..., None]
         pos, strength = (vec(torch.where(is_one, part, 0.0) for part in parts) for parts in (load.pos, load.strength))
-        load = load._replace(pos=pos, strength=strength, count=None)
+        load = load._replace(pos=pos, strength=strength, num_active=None)
     return [torch.stack(point_sum(load, markers)), *((after or state)[name] for name in PLANES)]
 
 
