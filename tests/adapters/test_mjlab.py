@@ -11,13 +11,13 @@ import pytest
 import scene_of_adapters
 import torch
 import warp as wp
+from capture_recorder import Recorder
 from mjlab.entity import EntityCfg
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.managers.observation_manager import ObservationGroupCfg, ObservationTermCfg
 from mjlab.managers.reward_manager import RewardTermCfg
 from mjlab.scene import SceneCfg
 from mjlab.sim import MujocoCfg, SimulationCfg
-from recorded_captures import Recorder
 
 import tgdsl
 from tgdsl.adapters.mjlab import TouchSensorCfg, observation, reading

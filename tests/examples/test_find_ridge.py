@@ -229,7 +229,6 @@ def test_half_a_minute_of_learning_with_touch_is_far_above_chance(tmp_path, monk
     monkeypatch.setattr(learn, "evaluate", partial(learn.evaluate, num=200))
     result = run("touch", 30, tmp_path)
     assert result.success > 0.6 > 5.0 * result.chance
-    assert result.success > 0.6 > 5.0 * result.chance
 
 
 def test_a_hand_and_the_scene_give_the_same_command(make):

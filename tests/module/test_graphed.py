@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from recorded_captures import Recorder
+from capture_recorder import Recorder
 
 from tgdsl.module.calls import Graphed
 

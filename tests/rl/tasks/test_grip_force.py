@@ -379,3 +379,19 @@ def test_the_keyframes_equal_the_scripts(monkeypatch):
         np.testing.assert_allclose(qpos, key.qpos, atol=2e-4)
         np.testing.assert_allclose(ctrl, key.ctrl, atol=2e-4)
     sys.modules.pop("grip_starts")
+
+
+@pytest.mark.slow
+def test_mujoco_warp_agrees():
+    """Over half a second with the same draws, forces agree to 5 % and 0.2 N, commands to rounding."""
+    forces = []
+    for simulator in ("mujoco", "warp"):
+        env = TouchEnv(DOCUMENT, NUM, overrides=PLAIN, simulator=simulator)
+        obs = env.reset(1)
+        for _ in range(20):
+            result = env.step(zero_actions(env))
+            assert not result.info.ended.any()
+        forces.append((obs["goal"].cpu(), force_of(result).cpu()))
+        env.close()
+    torch.testing.assert_close(forces[0][0], forces[1][0], rtol=1e-5, atol=0)
+    torch.testing.assert_close(forces[0][1], forces[1][1], rtol=0.05, atol=0.2)

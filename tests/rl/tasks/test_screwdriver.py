@@ -279,7 +279,7 @@ def test_the_hand_holds_the_screwdriver_without_actions():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("touch", ["force_torque", "elastomer", "force_taxel"])
+@pytest.mark.parametrize("touch", ["force_torque", "elastomer", "proximity", "force_taxel"])
 def test_all_kinds_of_touch_begin_with_a_grasp(touch):
     env = TouchEnv(DOCUMENT, 4, threads=1, overrides={"touch": touch, "resolution": "low", "grasps.num": 16})
     obs = env.reset(0)

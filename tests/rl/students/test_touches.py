@@ -14,7 +14,7 @@ from tgdsl.rl.students.keys import grid_of
 from tgdsl.rl.students.student import Images
 
 TYPES = ("bool", "agg_bool", "depth", "agg_force", "force", "force_torque")
-FEELS = [
+TOUCHES = [
     PolicyTouch(type_, placement, noise) for type_ in TYPES for placement in ("ends", "all") for noise in ("clean", "noisy")
 ]
 ENVS = 3
@@ -48,7 +48,7 @@ def assert_same(one, two):
 
 def test_each_group_equals_that_of_a_separate_environment(make):
     """Also with noise, where no other links draw numbers first; other observations are equal too."""
-    env = make(FEELS)
+    env = make(TOUCHES)
     together = rollout(env)
     assert "tactile_sensors" not in together
     for number, type_ in enumerate(TYPES):
@@ -64,7 +64,7 @@ def test_each_group_equals_that_of_a_separate_environment(make):
 
 
 def test_one_sensor_serves_all_types_placements_and_noises(make):
-    env = make(FEELS)
+    env = make(TOUCHES)
     assert {sensor.name for sensor in env.touch.plan.sensors if sensor.name in ("bit", "deep", "soft")} == {
         "bit",
         "deep",
