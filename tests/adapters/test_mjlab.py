@@ -175,7 +175,7 @@ def readings_over_resets(doc, device, graph, capture=None) -> list[torch.Tensor]
     env = make_env(SceneCfg(num_envs=2, entities=entities(), sensors=sensors), groups, device=device)
     sensor, result = env.scene["touch"], []
     if capture is not None:  # as on a GPU
-        sensor._is_graphed, sensor._graphed = True, Graphed(lambda *_: sensor._read_all(), capture)
+        sensor._is_graphed, sensor._graphed = True, Graphed(lambda *_: sensor._read(), capture)
     env.reset()
     push(env)
     for i in range(8):

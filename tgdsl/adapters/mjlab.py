@@ -46,7 +46,8 @@ class TouchSensor(Sensor):
     """The readings of all environments by name, `data`, of the module `touch`.
 
     They advance once a control step, whatever asks first, and are of the instant that mjlab's derived arrays then have: for
-    observations of now, for rewards a physics step earlier. An environment that is reset is read again.
+    observations of now, for rewards a physics step earlier. An environment that is reset is read again. On a GPU the tensors
+    are the same ones at each step.
     """
 
     data: Mapping[str, Float[Tensor, "env *step row channel"]]
@@ -55,8 +56,8 @@ class TouchSensor(Sensor):
         super().__init__()
         self.touch, self._cfg, self._elapsed = touch, cfg, 0.0
         self._due: Bool[Tensor, " env"] | None = None  # environments to read; None: all
-        self._observed: dict[str, Tensor] | None = None  # observation groups of the readings, once they are known
-        self._graphed, self._dt, self._has_run = Graphed(lambda *_: self._read_all()), 0.0, False
+        self._observed: dict[str, Tensor] = {}  # observation groups of the readings
+        self._graphed, self._dt, self._has_run = Graphed(lambda *_: self._read()), 0.0, False
 
     def edit_spec(self, scene_spec: mujoco.MjSpec, entities: Mapping[str, Any]) -> None:
         """Leave the scene as it is: contacts are read without sensors."""
@@ -104,37 +105,32 @@ class TouchSensor(Sensor):
     @property
     def observations(self) -> dict[str, Float[Tensor, "env feature"]]:
         """Observation groups of the document by name, of the readings in `data`."""
-        readings = self.data
-        self._observed = self._observed or self.touch.observe(readings)
+        _ = self.data
         return self._observed
 
     def _compute_data(self) -> dict[str, Tensor]:
-        num_envs = self._scene[2].nworld
-        dt = self._elapsed or self.touch.inputs.dt or float(self._scene[0].opt.timestep)
+        num_envs, touch = self._scene[2].nworld, self.touch
+        dt = self._elapsed or touch.inputs.dt or float(self._scene[0].opt.timestep)
         if dt != self._dt:
             self._dt = dt
             self._graphed.forget()
-        self._observed = None
+        is_replayed = self._due is None and self._is_graphed and self._has_run
         with torch.no_grad():
-            if self._due is None and self._is_graphed and self._has_run:
-                memory = self.touch.memory.tensors(num_envs, dt, self.touch.dtype, self.touch.device)
-                readings = self._graphed({}, memory)
-                self._observed = {name: readings.pop(f"observed/{name}") for name in self.touch.observations}
-                self.touch.record_outputs(readings)
-            else:
-                readings = self._read(self._due)
-        self._has_run, self._due = True, torch.zeros(num_envs, dtype=torch.bool, device=self.touch.device)
-        return readings
-
-    def _read_all(self) -> dict[str, Tensor]:
-        readings = self._read()
-        groups = self.touch.observe(readings) if self.touch.observations else {}
-        return readings | {f"observed/{name}": value for name, value in groups.items()}
+            memory = touch.memory.tensors(num_envs, dt, touch.dtype, touch.device) if is_replayed else {}
+            result = self._graphed({}, memory) if is_replayed else self._read(self._due)
+        self._observed = {name: result.pop(f"observed/{name}") for name in touch.observations}
+        if is_replayed:
+            touch.record_outputs(result)
+        self._has_run, self._due = True, torch.zeros(num_envs, dtype=torch.bool, device=touch.device)
+        return result
 
     def _read(self, mask: Bool[Tensor, " env"] | None = None) -> dict[str, Tensor]:
+        """Return readings by name, and observation groups below `observed/`."""
         state = self._state()
         state.dt = self._dt
-        return self.touch(state, mask=mask)
+        readings = self.touch(state, mask=mask)
+        groups = self.touch.observe(readings) if self.touch.observations else {}
+        return readings | {f"observed/{name}": value for name, value in groups.items()}
 
     def _state(self) -> SceneState:
         mj_model, model, data, inputs = self._scene

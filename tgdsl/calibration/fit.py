@@ -154,16 +154,10 @@ def calibrate(
         SpecError: All mistakes in the document, or in a recording, by its keys.
         TgdslError: If a parameter does not exist or is no number, or there are fewer numbers than unknowns.
     """
-    maps = [
-        ("reading", value, get_args(ReadingMap)) for value in (reading.values() if isinstance(reading, Mapping) else [reading])
-    ]
-    for name, value, choices in (
-        *maps,
-        ("hold_out", hold_out, get_args(HoldOut)),
-        ("intervals", intervals, get_args(Intervals)),
-    ):
-        if value not in choices:
-            raise TgdslError(f'{name}: found "{value}"; {did_you_mean(str(value), choices, "values")}')
+    for each in reading.values() if isinstance(reading, Mapping) else [reading]:
+        _check_choice("reading", each, get_args(ReadingMap))
+    _check_choice("hold_out", hold_out, get_args(HoldOut))
+    _check_choice("intervals", intervals, get_args(Intervals))
     progress("compiling")
     model = Model(document, fit, overrides, kinds)
     sources = [recordings] if isinstance(recordings, (str, Path, Mapping)) else list(recordings)
@@ -184,6 +178,11 @@ def calibrate(
     notes = _warnings(problem, solution, uncertainty, fitted, errors)
     model.set(problem.values(solution.x))
     return Fit({f.path: f for f in fitted}, _nuisances(problem, solution), errors, notes, problem, solution)
+
+
+def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
+    if value not in choices:
+        raise TgdslError(f'{name}: found "{value}"; {did_you_mean(str(value), choices, "values")}')
 
 
 def _loaded(source: str | Path | Arrays, name: str, touch: TactileModule) -> Recording:
@@ -273,13 +272,12 @@ def _warnings(
 ) -> tuple[str, ...]:
     """Return unidentified parameters and signs of a wrong model, each with name and number."""
     notes, names = [], problem.names
+    is_silent = np.isinf(uncertainty.sigma).any() and not any(part.any() for part in problem.predicted(solution.x))
     for j, each in enumerate(fitted):
         parameter, u = each.parameter, solution.x[j]
         if np.isinf(uncertainty.sigma[j]):
-            is_silent = not any(part.any() for part in problem.predicted(solution.x))
-            hint = (
-                "the sensors read 0 in all samples: does an object touch them? Poses are in m" if is_silent else "leave it out"
-            )
+            silent = "the sensors read 0 in all samples: does an object touch them? Poses are in m"
+            hint = silent if is_silent else "leave it out"
             notes.append(f"{each.path}: no reading depends on it; {hint}")
         elif not each.is_identified:
             notes.append(f"{each.path}: the data do not tell it: 95 % are {each.low:.4g} to {each.high:.4g} {parameter.unit}")

@@ -210,7 +210,8 @@ def _rows(reading: torch.Tensor) -> np.ndarray:
 def _bounded(path: str, start: float, quantity: Quantity, usual: Usual | None, span: str, unit: str) -> Parameter:
     """Return a parameter with the user's bounds, or with bounds from its field."""
     least = next((bound for bound in (quantity.ge, quantity.gt) if bound is not None), -math.inf)
-    most, of_unit = math.inf if quantity.le is None else quantity.le, f" {unit}" if unit else ""
+    most = math.inf if quantity.le is None else quantity.le
+    of_unit = f" {unit}" if unit else ""
     if span:
         parts = span.split(":")
         if len(parts) != 2:

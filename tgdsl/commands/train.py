@@ -118,10 +118,9 @@ class Train:
             if state is not None and self.resume is not None:
                 restore(learner, state, self.resume / "checkpoint.pt")
                 learner.change_rates(before.get("spec", {}).get("train", {}))
-            if start is not None:
-                learner.start_from(start)
             origin = run_origin(loaded, env, seed, overrides, ranks.size)
             if start is not None:
+                learner.start_from(start)
                 origin["starts_from"] = str(start.file)
             if self.resume is not None:
                 origin["goes_on_from"] = str(self.resume)

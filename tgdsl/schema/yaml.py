@@ -45,9 +45,7 @@ class Source:
     keys: dict[Path, Mark] = field(default_factory=dict)  # place of the key of each mapping entry, by its path
     values: dict[Path, Mark] = field(default_factory=dict)  # place of each value, by its path
     problems: list[Problem] = field(default_factory=list)
-    added: dict[str, str] = field(
-        default_factory=dict
-    )  # paths that overrides began, with a hint if a sibling has a similar name
+    added: dict[str, str] = field(default_factory=dict)  # hints by path, of new entries with a name like a sibling's
 
     def problem(self, path: Path, what: str, hint: str = "", on_key: bool = False) -> Problem:
         """Return a mistake at a path, placed at the nearest part of it that the document holds."""

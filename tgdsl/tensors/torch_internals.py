@@ -147,7 +147,7 @@ def inductor_options(checks_indices: bool, has_tiles: bool, has_slots: bool, is_
     """Return options for torch.compile, which are names of Inductor's private configuration.
 
     Kernels may assert that indices read from tensors are in range; on a GPU have tiles of 32 × 32 of two axes, not blocks of
-    one flat axis, for plans with or without slots of contacts; and have as many operations as can be, instead of 64 at most.
+    one flat axis; sum over slots of contacts; and have as many operations as can be, instead of 64 at most.
     """
     # Sizes of blocks are chosen by timing, but of a kernel that takes 10 µs that is the time of its launch. Without timing sums
     # over slots have one row a block (47 µs for 5), from where coordinate descent goes on; of a depth alone it chooses worse

@@ -96,8 +96,8 @@ def test_policies_that_do_not_fit_are_refused(tmp_path):
     teacher, loaded = small_learner(tmp_path)
     saved = written(teacher, loaded, tmp_path)
     for overrides, message in (
-        ({"train__networks__hidden": "[9]"}, "its network has other sizes: mlp.0.weight is (8, "),
-        ({"train__networks__hidden": "[8, 8]"}, "its network has "),
+        ({"train__networks__hidden": "[9]"}, "its network is not that of train.networks: size mismatch for mlp.0.weight"),
+        ({"train__networks__hidden": "[8, 8]"}, "its network is not that of train.networks: Missing key(s)"),
         ({"train__actor": "[goal]"}, "not goal; try --set train.actor="),
     ):
         learner, _ = small_learner(tmp_path, **overrides)

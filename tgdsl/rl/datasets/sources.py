@@ -113,7 +113,7 @@ def of_deployment(
     least: float | None = None,
 ) -> tuple[Header, Iterator[Episode]]:
     """Return episodes of a policy on an emulated hand, a real one or a log: the force on each fingertip."""
-    prepared, touch = deployment.prepared, deployment.prepared.touch
+    prepared, touch = deployment.prepared, deployment.prepared.policy_touch
     if touch is None or touch.type != EMULATED or "proprio" not in prepared.groups:
         problem = f"this policy feels {'nothing' if touch is None else touch.type}"
         raise TgdslError(f"{prepared.saved.file}: {problem}; of a hand, expected one that feels {EMULATED}, and proprio")

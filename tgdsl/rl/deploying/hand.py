@@ -66,7 +66,7 @@ class Prepared:
     saved: PolicyFile
     loaded: LoadedTask  # the task's document, with the policy's touch and goal
     sensors: TaskSensors  # its module: the sensors of policy and task, and the joints
-    touch: PolicyTouch | None  # the policy's touch; None without touch
+    policy_touch: PolicyTouch | None  # the policy's touch; None without touch
     groups: Mapping[str, int]  # groups of observations that it takes, in its order, with their sizes
     goal: tuple[float, ...] | None  # the user's goal; None: the goal of the scene's task
     model: mujoco.MjModel
@@ -280,8 +280,8 @@ class Hand:
             goal=self._goal if self._scene is None else self._scene.goal,
         )
         result = {"proprio": groups.proprio(now, spec.proprio.vel_scale)} | prepared.loaded.task.observe_hand(spec, now)
-        if prepared.touch is not None:
-            result[GROUP] = observed[prepared.sensors.groups[prepared.touch.group].observation].cpu()
+        if prepared.policy_touch is not None:
+            result[GROUP] = observed[prepared.sensors.groups[prepared.policy_touch.group].observation].cpu()
         return {name: result[name].float() for name in prepared.groups}
 
     def step(self, action: Float[Tensor, "env joint"]) -> Step:

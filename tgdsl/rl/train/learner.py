@@ -211,6 +211,7 @@ PROPRIO, PRIVILEGED, STATE, PROPS = "proprio", "priv_proprio", "priv_obj_state",
 """Groups of the hand's joints; of joints and forces; of the object's motion; of its properties."""
 MOST_STD = 1e6  # bound above of the actions' standard deviation: rsl_rl's
 CRITIC_FIRST = 25  # iterations in which only the critic learns, after a start from a policy
+STD = "distribution.std_param"  # name of the actions' deviations among an actor's weights
 SAME_ACTIONS = 1e-3  # largest difference between the actions of a policy and of the network that took over its weights
 
 PPO_OPTIONS = {
@@ -291,7 +292,7 @@ class Learner(Learning):
         train = self._train = loaded.spec.train
         super().__init__(env, ranks or Ranks(), train.steps, train.desynchronise)
         self._score: float | None = None  # of the episodes that have ended last
-        self._critic_first = 0  # iterations in which only the critic learns
+        self._critic_until = 0  # iteration until which only the critic learns
         settings = config(loaded, env.groups, self.ranks.rsl_rl)
         self.groups = settings["obs_groups"]
         self._names = list(dict.fromkeys(name for names in self.groups.values() for name in names))
@@ -312,9 +313,8 @@ class Learner(Learning):
     def iterate(self, share: float = 0.0) -> Iteration:
         """Make a rollout, and learn from it; `share` has no effect: the rate adapts to the policy, or is constant."""
         self.env.curricula.advance(self.iteration, self._score)
-        kept = [
-            (part, part.detach().clone()) for part in self.algorithm.actor.parameters() if self.iteration < self._critic_first
-        ]
+        actor = self.algorithm.actor.parameters() if self.iteration < self._critic_until else ()
+        kept = [(part, part.detach().clone()) for part in actor]
         result = super().iterate(share)
         with torch.no_grad():
             for part, before in kept:
@@ -325,12 +325,12 @@ class Learner(Learning):
     def state_dict(self) -> dict[str, Any]:
         algorithm = self.algorithm
         steps = algorithm.rnd.update_counter if algorithm.rnd else 0
-        saved = {"algorithm": algorithm.save(), "rnd_steps": steps, "score": self._score}
-        return saved | {"critic_first": self._critic_first}
+        numbers = {"rnd_steps": steps, "score": self._score, "critic_until": self._critic_until}
+        return {"algorithm": algorithm.save()} | numbers
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Resume from a saved state: see `Learning`. RND that was off until then starts from scratch."""
-        self._score, self._critic_first = state.get("score"), state.get("critic_first", 0)
+        self._score, self._critic_until = state.get("score"), state.get("critic_until", 0)
         saved, has_rnd = dict(state["algorithm"]), "rnd_state_dict" in state["algorithm"]
         self.algorithm.load(saved, dict.fromkeys(("actor", "critic", "optimizer", "iteration"), True) | {"rnd": has_rnd}, True)
         if self.algorithm.rnd and has_rnd:
@@ -338,7 +338,7 @@ class Learner(Learning):
 
     @property
     def std(self) -> list[float] | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        std = dict(self.algorithm.actor.named_parameters()).get("distribution.std_param")
+        std = dict(self.algorithm.actor.named_parameters()).get(STD)
         return None if std is None else std.tolist()
 
     def start_from(self, saved: PolicyFile) -> None:
@@ -351,19 +351,15 @@ class Learner(Learning):
         if list(policy.groups) != self.groups["actor"]:
             hint = f"try --set train.actor={json.dumps(list(policy.groups))}"
             raise PolicyError(f"{saved.file}: learned from {listed(policy.groups)}, not {listed(self.groups['actor'])}; {hint}")
-        weights = actor_weights(saved.module(self.env.device))
-        own = actor.state_dict()
-        needed = [name for name in own if not name.startswith("distribution.")]
-        if wrong := [name for name in needed if name in weights and weights[name].shape != own[name].shape]:
-            sizes = f"{wrong[0]} is {tuple(weights[wrong[0]].shape)}, here {tuple(own[wrong[0]].shape)}"
-            raise PolicyError(f"{saved.file}: its network has other sizes: {sizes}; see train.networks")
-        if lacking := [name for name in needed if name not in weights and not name.endswith(".count")]:
-            raise PolicyError(f"{saved.file}: its network has no {lacking[0]}, expected the layers of train.networks")
-        actor.load_state_dict({name: weights[name].to(own[name]) for name in needed if name in weights}, strict=False)
-        if not any(name.endswith(".count") for name in weights):  # a student's moments are constant
-            actor.obs_normalizer.count.fill_(int((saved.card or {}).get("samples", UNTIL)))
-        if policy.std is not None and "distribution.std_param" in own:
-            dict(actor.named_parameters())["distribution.std_param"].data.copy_(policy.std)
+        weights = {name: value for name, value in actor.state_dict().items() if name.startswith("distribution.")}
+        weights |= actor_weights(saved.module(self.env.device), (saved.card or {}).get("samples", UNTIL))
+        if policy.std is not None and STD in weights:
+            weights[STD] = policy.std
+        try:
+            actor.load_state_dict(weights)
+        except RuntimeError as error:
+            problem = str(error).splitlines()[1].strip()
+            raise PolicyError(f"{saved.file}: its network is not that of train.networks: {problem}") from error
         obs = self.env.observe()
         x = torch.cat([obs[name] for name in policy.groups], dim=1).float()
         with torch.no_grad():
@@ -371,7 +367,7 @@ class Learner(Learning):
         if not apart <= SAME_ACTIONS:
             hint = "a student normalises by train.networks.eps=1e-5 and train.networks.clip=10"
             raise PolicyError(f"{saved.file}: with its weights, train.networks acts otherwise, by up to {apart:.2g}; {hint}")
-        self._critic_first = self.iteration + CRITIC_FIRST
+        self._critic_until = self.iteration + CRITIC_FIRST
 
     def write_policy(self, card: Mapping[str, Any], file: Path) -> None:
         """Write the policy without exploration, as TorchScript and ONNX, and its card as a readable JSON file."""

@@ -184,17 +184,20 @@ class Exported(nn.Module):
         return (torch.zeros((2, self.model.obs_dim), dtype=first.dtype, device=first.device),)
 
 
-def actor_weights(policy: nn.Module) -> dict[str, Tensor]:
-    """Return the weights of a policy's TorchScript by their names in an `EncodedModel`, a student's too."""
+def actor_weights(policy: nn.Module, num_samples: int) -> dict[str, Tensor]:
+    """Return the weights of a policy's TorchScript by their names in an `EncodedModel`.
+
+    Of a student, whose moments are not counted, they count as those of `num_samples` observations.
+    """
     result = {}
     for name, value in policy.state_dict().items():
         name = re.sub(r"^student\.encoders\.(\d+)\.layers\.", r"encoders.\1.", name.removeprefix("model."))
         result[re.sub(r"^student\.trunk\.", "mlp.", name)] = value
     for name in ("mean", "var"):
         if f"student.{name}" in result:
-            result[f"obs_normalizer._{name}"] = result.pop(f"student.{name}")[None]
-    if "obs_normalizer._var" in result:
-        result.setdefault("obs_normalizer._std", result["obs_normalizer._var"].sqrt())
+            value = result[f"obs_normalizer._{name}"] = result.pop(f"student.{name}")[None]
+            if name == "var":
+                result |= {"obs_normalizer._std": value.sqrt(), "obs_normalizer.count": torch.tensor(num_samples)}
     return result
 
 
