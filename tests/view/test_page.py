@@ -800,9 +800,10 @@ def test_a_browser_shows_a_document_and_its_controls_work(browser, document):
 @pytest.mark.slow
 def test_a_browser_shows_a_run_and_scrubs_it(browser, recording):
     with serving(View(recording)) as page:
-        view = open_page(browser, page)
         with at_rest(page):
+            view = open_tab(browser, page.url)
             assert soon(lambda: is_drawn(view))
+        assert soon(lambda: not field_of(view, "pause").is_checked())  # the scene goes on in the browser too
         field_of(view, "pause").dispatch_event("click")
         assert soon(lambda: page.panel.paused.value)
         write(view, "step", "2")
