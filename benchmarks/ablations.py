@@ -1,87 +1,399 @@
-"""Results of students with different touch, and the pages that compare them: docs/background and docs/records/ablations.md.
+"""Compare students that differ in their sense of touch, on docs/background/ablations.md and docs/records/ablations.md.
 
-    python benchmarks/ablations.py collect out/ablation in_palm_rotate_types --teacher out/teacher.json --rest out/rest.json
-    python benchmarks/ablations.py reading                    # how well the force of grip_force can be read from each type
-    python benchmarks/ablations.py page                       # tables and plots from all that is kept
+    python benchmarks/ablations.py keep out/cube_400 cube --teacher out/teacher.json --rest out/rest.json
+    python benchmarks/ablations.py page
 
-`collect` copies a run's tables and thinned curves to docs/measured/ablations, in place of what was kept under the name; a run
-that went on with --resume is collected again. Runs that differ in their overrides alone, as in students' networks, are kept as
-SERIES__WHAT and have one table and plot. `page` writes between the markers of both pages, and a plot of each run to
-docs/images/ablation_NAME.png.
+`keep` copies the results of `tgdsl distill` to docs/measured/ablations/NAME; `page` writes tables and plots from all results
+there. Runs with more iterations are kept under the same name. Names SERIES__NETWORKS share a section and a plot.
+
+A student has **converged** if twice as many iterations change its score by less than 5 % of that score. A type is **worse**
+than another in the same place if both have converged and the 95 % intervals of their scores, over seeds and episodes, do not
+overlap.
+
+docs/measured/ablations/NAME holds
+
+- run.json: document, teacher, overrides, devices, environments, and the evaluations of the teacher and of joints at rest;
+- ITERATIONS/table.csv: scores, as `tgdsl distill` wrote them;
+- ITERATIONS/RESOLUTION.csv: at most 60 rows of each student's curve, without episodes that began before the run.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import io
+import json
+import math
 import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, get_type_hints
 
-from ablations_collect import ROWS, collect
-from ablations_kept import KEPT, ROOT
-from ablations_page import PAGE, READING, RECORD, write_page, write_summary
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from tgdsl.errors import TgdslError
+from tgdsl.files.write import atomic_write_all, with_folder
+from tgdsl.rl.load import load_task
+from tgdsl.rl.spec import touch_types
+from tgdsl.rl.students.keys import NONE
+from tgdsl.rl.students.results import Row
+
+ROOT = Path(__file__).parents[1]
+KEPT = ROOT / "docs" / "measured" / "ablations"
+PAGES = ROOT / "docs" / "background" / "ablations.md", ROOT / "docs" / "records" / "ablations.md"
+BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
+CHANGE = 0.05  # relative change of the score below which a student has converged
+POINTS = 60  # rows of a kept curve
+YARDSTICKS = {"teacher": "teacher", "rest": "joints at rest"}
+COLOURS = {name: colormaps["tab10"](i % 10) for i, name in enumerate(touch_types())} | {NONE: "black"}
+Place = tuple[str, str, str]  # placement, resolution and noise
 
 
-def collected(given: argparse.Namespace) -> None:
-    size = collect(given.run, given.name, given.teacher, given.rest, given.kept, given.rows)
-    print(f"{given.kept / given.name}: {size / 1e3:.0f} kB")
+class AblationError(TgdslError):
+    """Results that cannot be kept or compared."""
 
 
-def read(given: argparse.Namespace) -> None:
-    from ablations_reading import readings, record, write_readings
+@dataclass(frozen=True)
+class Kept:
+    """Results under one name: rows of the tables and curves by number of iterations."""
 
-    from tgdsl.console.tables import text_table
-    from tgdsl.files.write import check_writable
-    from tgdsl.rl.load import load_task
-    from tgdsl.rl.sensors import num_variants
+    name: str
+    run: dict[str, Any]
+    rows: dict[int, list[Row]]
+    curves: dict[int, dict[str, dict[str, np.ndarray]]]  # by iterations, resolution and column
 
-    check_writable(given.out)
-    loaded = load_task(given.task)
-    recorded = record(loaded, given.teacher, given.envs, given.episodes, given.placement)
-    found = readings(recorded, num_variants(loaded))
-    cells = [(own.type, f"{own.numbers}", f"{own.r2:.3f}", f"{own.rms:.3f}", f"{own.relative:.1%}") for own in found]
-    print(text_table(("type", "numbers", "R²", "RMS error [N]", "relative"), cells))
-    write_readings(found, given.out, sys.argv[1:])
-    print(given.out)
+    @property
+    def series(self) -> str:
+        """Return the part of the name before `__`."""
+        return self.name.partition("__")[0]
+
+    @property
+    def networks(self) -> str:
+        """Return the part of the name after `__`, empty without one."""
+        return self.name.partition("__")[2]
+
+    @property
+    def final(self) -> dict[tuple[str, Place], tuple[int, Row]]:
+        """Return the row with the most iterations of each type and place, and these iterations."""
+        return {(row.type, place_of(row)): (n, row) for n in sorted(self.rows) for row in self.rows[n]}
+
+    @property
+    def places(self) -> list[Place]:
+        """Return all places with touch, in the order of the tables."""
+        return list(dict.fromkeys(place_of(row) for rows in self.rows.values() for row in rows if row.type != NONE))
+
+    def before(self, row: Row, iterations: int) -> Row | None:
+        """Return the row of the same students after half as many iterations."""
+        half = self.rows.get(iterations // 2, []) if iterations % 2 == 0 else []
+        return next((own for own in half if (own.type, place_of(own)) == (row.type, place_of(row))), None)
+
+    def has_converged(self, row: Row, iterations: int) -> bool | None:
+        """Return whether students have converged; None: no run had half as many iterations."""
+        before = self.before(row, iterations)
+        return None if before is None else abs(row.score - before.score) < CHANGE * abs(row.score)
+
+    def worse_than(self, row: Row, iterations: int) -> list[str]:
+        """Return the types in the same place that a type is worse than."""
+        sign = -1.0 if self.run["is_less_better"] else 1.0
+        converged = [own for n, own in self.final.values() if self.has_converged(own, n)]
+        if row not in converged:
+            return []
+        beside = [own for own in converged if place_of(own) == place_of(row) or (NONE in (own.type, row.type))]
+        low, high = ("low", "high") if sign > 0 else ("high", "low")
+        return [own.type for own in beside if sign * getattr(row, high) < sign * getattr(own, low)]
 
 
-def paged(given: argparse.Namespace) -> None:
-    for file in (*write_page(given.kept, given.page), write_summary(given.kept, given.summary)):
-        print(file)
+def place_of(row: Row) -> Place:
+    return row.placement, row.resolution, row.noise
+
+
+def keep(run: Path, name: str, evaluations: Mapping[str, Path | None], folder: Path = KEPT) -> Path:
+    """Keep a run of `tgdsl distill` under a name; return the folder.
+
+    Raises:
+        AblationError: If files are missing, or the name has results of another task or teacher; nothing is written.
+    """
+    distill, table = _read_json(run / "distill.json"), _read(run / "table.csv")
+    curves: dict[str, bytes] = {}
+    iterations, devices, document = 0, [], ""
+    for resolution in distill["resolutions"]:
+        starts = _read_json(run / resolution / "run.json")["starts"]
+        curve = list(csv.DictReader(io.StringIO(_read(run / resolution / "curve.csv"))))
+        iterations, document = int(curve[-1]["iteration"]), starts[-1]["task"]
+        devices += [start["device"] for start in starts]
+        curves[f"{resolution}.csv"] = _thinned(curve, starts).encode()
+    task = load_task(document if Path(document).is_file() else ROOT / document).task
+    made = {"document": _relative(document), "unit": task.score_unit, "is_less_better": task.is_less_better}
+    made |= {"teacher": _relative(distill["teacher"]), "envs": distill["envs"], "devices": sorted(set(devices))}
+    made |= {"overrides": distill["overrides"], "scores": {}}
+    before = _read_json(folder / name / "run.json") if (folder / name / "run.json").is_file() else {}
+    for key in ("document", "teacher") if before else ():
+        if before[key] != made[key]:
+            raise AblationError(f"{name}: its results have {key} {before[key]}, this run has {made[key]}; choose another name")
+    for who, file in evaluations.items():
+        evaluation = _read_json(file) if file else before.get("scores", {}).get(who)
+        if evaluation is not None:
+            made["scores"][who] = {key: evaluation[key] for key in ("score", "score_interval", "held", "episodes")}
+    files = {"table.csv": table.encode(), **curves}
+    contents = {folder / name / str(iterations) / file: content for file, content in files.items()}
+    contents[folder / name / "run.json"] = (json.dumps(made, indent=1, ensure_ascii=False) + "\n").encode()
+    for file in contents:
+        with_folder(file)
+    atomic_write_all(contents)
+    return folder / name
+
+
+def _thinned(curve: Sequence[Mapping[str, str]], starts: Sequence[Mapping[str, Any]]) -> str:
+    """Return means over equal spans of control steps as CSV; `samples` and `seconds` are those at the end of a span.
+
+    When a run begins or continues, episodes begin midway: scores of the first episode's length are left out.
+    """
+    iteration, samples, seconds = (
+        np.array([float(row[name]) for row in curve]) for name in ("iteration", "samples", "seconds")
+    )
+    is_partial = np.zeros(len(curve), dtype=bool)
+    for start in starts:
+        spec, first = start["spec"], start.get("iteration", 0)
+        steps = spec["episode"] / (spec["physics"]["timestep"] * spec["physics"]["substeps"]) / spec["distill"]["steps"]
+        is_partial |= (iteration > first) & (iteration <= first + math.ceil(steps))
+    names = [name for name in curve[0] if name.startswith("Score/")]
+    columns = names + [name for name in ("rollout", "update") if name in curve[0]]
+    values = {name: np.array([float(row[name] or "nan") for row in curve]) for name in columns}
+    for name in names:
+        values[name][is_partial] = np.nan
+    span = np.ceil(samples / samples[-1] * POINTS - 1e-9)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["samples", "seconds", *columns])
+    for own in np.unique(span):
+        part = span == own
+        known = {name: value[part & np.isfinite(value)] for name, value in values.items()}
+        means = [f"{value.mean():.4g}" if len(value) else "" for value in known.values()]
+        writer.writerow([round(samples[part][-1] / len(names)), f"{seconds[part][-1]:.4g}", *means])
+    return text.getvalue()
+
+
+def kept_runs(folder: Path = KEPT) -> list[Kept]:
+    """Return all results, by name."""
+    return [_kept(file.parent) for file in sorted(folder.glob("*/run.json"))]
+
+
+def _kept(folder: Path) -> Kept:
+    rows: dict[int, list[Row]] = {}
+    curves: dict[int, dict[str, dict[str, np.ndarray]]] = {}
+    kinds = get_type_hints(Row)
+    for table in sorted(folder.glob("*/table.csv")):
+        n = int(table.parent.name)
+        rows[n] = [Row(**{key: kinds[key](row[key]) for key in kinds}) for row in csv.DictReader(io.StringIO(_read(table)))]
+        curves[n] = {}
+        for file in set(table.parent.glob("*.csv")) - {table}:
+            lines = list(csv.DictReader(io.StringIO(_read(file))))
+            curves[n][file.stem] = {key: np.array([float(line[key] or "nan") for line in lines]) for key in lines[0]}
+    return Kept(folder.name, _read_json(folder / "run.json"), rows, curves)
+
+
+def summary(runs: Sequence[Kept]) -> str:
+    """Return a table of scores: a row per type, a column per place where more than two types were compared."""
+    columns = [(run, place) for run in runs for place in run.places if len({row.type for row in run.rows[max(run.rows)]}) > 2]
+    types = dict.fromkeys(type_ for run, place in columns for type_, own in run.final if own == place)
+    head = [f"`{Path(run.run['document']).stem}`, {_title(run, place)} [{run.run['unit']}]" for run, place in columns]
+    lines = [("type", *head), ("---", *["---:"] * len(head))]
+    for type_ in (*types, NONE):
+        cells = []
+        for run, place in columns:
+            own = ("", place[1], "") if type_ == NONE else place
+            n, row = run.final.get((type_, own), (0, None))
+            cells.append("–" if row is None else f"{row.score:.3f}{'' if run.has_converged(row, n) else '†'}")
+        lines.append((f"`{type_}`", *cells))
+    for who, title in YARDSTICKS.items():
+        lines.append(
+            (
+                f"*{title}*",
+                *(f"{run.run['scores'][who]['score']:.3f}" if who in run.run["scores"] else "–" for run, _ in columns),
+            )
+        )
+    return _markdown(lines) + "\n\n† not known to have converged"
+
+
+def sections(runs: Sequence[Kept]) -> str:
+    """Return a section per series: conditions, a table, and the plot."""
+    parts = []
+    for series, members in _by_series(runs).items():
+        first = members[0].run
+        said = f"Task `{first['document']}`, teacher `{first['teacher']}`, "
+        said += f"on {', '.join(first['devices'])}, {first['envs']:,} environments."
+        head = (
+            "where",
+            "type",
+            f"score [{first['unit']}]",
+            "95 %",
+            "iterations",
+            "after half of them",
+            "converged",
+            "worse than",
+        )
+        lines = [(*head, "seeds", "held", "million control steps"), ("---",) * 11]
+        for run in members:
+            sign = 1.0 if first["is_less_better"] else -1.0
+            order = sorted(run.final.values(), key=lambda each: (each[1].type == NONE, place_of(each[1]), sign * each[1].score))
+            for n, row in order:
+                before, converged = run.before(row, n), run.has_converged(row, n)
+                cells = [
+                    _title(run, place_of(row)),
+                    f"`{row.type}`",
+                    f"{row.score:.3f}",
+                    _bounds((row.low, row.high)),
+                    f"{n:,}",
+                ]
+                cells += ["–" if before is None else f"{before.score:.3f}", {None: "–", True: "yes", False: "no"}[converged]]
+                cells += [", ".join(f"`{name}`" for name in run.worse_than(row, n)) or "–", f"{row.seeds}", f"{row.held:.1%}"]
+                lines.append((*cells, f"{row.samples / 1e6:.3g}"))
+        for who, title in YARDSTICKS.items():
+            if own := first["scores"].get(who):
+                lines.append(
+                    (
+                        "",
+                        f"*{title}*",
+                        f"{own['score']:.3f}",
+                        _bounds(own["score_interval"]),
+                        *[""] * 5,
+                        f"{own['held']:.1%}",
+                        "",
+                    )
+                )
+        rows = [(n, row) for run in members for n, row in run.final.values()]
+        share = sum(bool(run.has_converged(row, n)) for run in members for n, row in run.final.values())
+        counted = f"{share} of {len(rows)} rows have converged."
+        image = f"![Scores by control steps: {series}](../images/ablation_{series}.png)"
+        parts.append("\n\n".join([f"### {series}", said, _overrides(members), _markdown(lines), counted, image]))
+    return "\n\n".join(parts) or "There are no results yet."
+
+
+def plot(members: Sequence[Kept]) -> Figure:
+    """Return scores by control steps, a panel per place: mean, least and largest of the seeds."""
+    places = [(run, place) for run in members for place in run.places]
+    columns = min(3, math.ceil(math.sqrt(len(places))))
+    rows = math.ceil(len(places) / columns)
+    figure = Figure(figsize=(1.5 + 4.2 * columns, 3.4 * rows), dpi=100, layout="constrained")
+    panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
+    for axes, (run, place) in zip(panels, places, strict=False):
+        for (type_, own), (n, row) in run.final.items():
+            if own not in (place, ("", place[1], "")):
+                continue
+            curve = run.curves[n][place[1]]
+            scores = np.stack(list(_scores(curve, row)))
+            millions = curve["samples"] / 1e6
+            axes.plot(millions, scores.mean(axis=0), color=COLOURS.get(type_, "grey"), linewidth=1.3, label=type_)
+            axes.fill_between(
+                millions, scores.min(axis=0), scores.max(axis=0), color=COLOURS.get(type_, "grey"), alpha=0.15, linewidth=0
+            )
+        for (who, title), dashes in zip(YARDSTICKS.items(), ("--", ":"), strict=True):
+            if who in run.run["scores"]:
+                axes.axhline(run.run["scores"][who]["score"], color="black", linestyle=dashes, linewidth=1.0, label=title)
+        axes.set_title(_title(run, place), fontsize=9, loc="left")
+        axes.set_xlabel("million control steps of each student", fontsize=9)
+        axes.grid(True, color="#e3e5e8", linewidth=0.6)
+    for axes in panels[len(places) :]:
+        axes.set_axis_off()
+    for axes in panels[::columns]:
+        axes.set_ylabel(f"score [{members[0].run['unit']}]", fontsize=9)
+    handles = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside right upper", frameon=False, fontsize=8)
+    return figure
+
+
+def _scores(curve: Mapping[str, np.ndarray], row: Row) -> Iterator[np.ndarray]:
+    kind = "-".join(part for part in (row.type, row.placement, row.noise) if part).replace("*", "_").replace("/", "_")
+    return (curve[f"Score/{kind}-s{seed}"] for seed in range(row.seeds))
+
+
+def write_pages(folder: Path = KEPT, pages: tuple[Path, Path] = PAGES) -> list[Path]:
+    """Write tables between the markers of both pages, and the plots; return the files."""
+    runs = kept_runs(folder)
+    contents = {page: _between(page, text) for page, text in zip(pages, (summary(runs), sections(runs)), strict=True)}
+    for series, members in _by_series(runs).items():
+        png = io.BytesIO()
+        FigureCanvasAgg(plot(members)).print_png(png, metadata={"Software": None})
+        contents[with_folder(pages[1].parents[1] / "images" / f"ablation_{series}.png")] = png.getvalue()
+    atomic_write_all(contents)
+    return list(contents)
+
+
+def _between(page: Path, text: str) -> bytes:
+    before, begin, rest = _read(page).partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (begin and end):
+        raise AblationError(f"{page}: expected the lines {BEGIN} and {END}")
+    return f"{before}{begin}\n\n{text}\n\n{end}{after}".encode()
+
+
+def _by_series(runs: Sequence[Kept]) -> dict[str, list[Kept]]:
+    return {series: [run for run in runs if run.series == series] for series in dict.fromkeys(run.series for run in runs)}
+
+
+def _title(run: Kept, place: Place) -> str:
+    return ", ".join(part for part in (run.networks, *place) if part)
+
+
+def _overrides(members: Sequence[Kept]) -> str:
+    lines = []
+    for run in members:
+        settings = ", ".join(f"`{name}={value}`" for name, value in run.run["overrides"].items())
+        lines.append(f"Overrides{f' of {run.networks}' if run.networks else ''}: {settings or 'none'}.")
+    return "\n\n".join(lines)
+
+
+def _bounds(interval: Sequence[float]) -> str:
+    return "{:.3f} to {:.3f}".format(*interval) if all(map(math.isfinite, interval)) else "–"
+
+
+def _markdown(lines: Sequence[Sequence[str]]) -> str:
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def _relative(file: str) -> str:
+    path = Path(file)
+    if not path.is_absolute():
+        return file
+    return path.relative_to(ROOT).as_posix() if path.is_relative_to(ROOT) else path.name
+
+
+def _read(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8")
+    except OSError as error:
+        raise AblationError(f"{file}: {error.strerror}; expected a file of tgdsl distill or evaluate") from error
+
+
+def _read_json(file: Path) -> dict[str, Any]:
+    try:
+        return json.loads(_read(file))
+    except ValueError as error:
+        raise AblationError(f"{file}: {error}") from error
 
 
 def main() -> None:
-    """Read the command line."""
+    """Keep a run, or write the pages."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    kinds = parser.add_subparsers(required=True)
-    own = kinds.add_parser("collect")
-    own.add_argument("run", type=Path, help="folder of a run of tgdsl distill")
-    own.add_argument("name", help="name of the ablation: small letters, digits, _")
-    own.add_argument("--teacher", type=Path, help="what tgdsl evaluate --policy TEACHER --out wrote")
-    own.add_argument("--rest", type=Path, help="what tgdsl evaluate --out wrote without a policy")
-    own.add_argument("--rows", type=int, default=ROWS, help="most rows of each curve")
-    own.add_argument("--kept", type=Path, default=KEPT)
-    own.set_defaults(run_it=collected)
-    own = kinds.add_parser("reading")
-    own.add_argument("task", type=Path, nargs="?", default=ROOT / "examples" / "tasks" / "grip_force.yaml")
-    own.add_argument("--teacher", type=Path, default=ROOT / "policies" / "grip_force.pt")
-    own.add_argument("--envs", type=int, default=48)
-    own.add_argument("--episodes", type=int, default=4, help="episodes' worth of control steps in each environment")
-    own.add_argument("--placement", default="hand")
-    own.add_argument("--out", type=Path, default=KEPT / READING)
-    own.set_defaults(run_it=read)
-    own = kinds.add_parser("page")
-    own.add_argument("--kept", type=Path, default=KEPT)
-    own.add_argument("--page", type=Path, default=RECORD, help="page for the tables of all runs")
-    own.add_argument("--summary", type=Path, default=PAGE, help="page for the table of mean scores")
-    own.set_defaults(run_it=paged)
-    given = parser.parse_args()
+    actions = parser.add_subparsers(dest="action", required=True)
+    keeping = actions.add_parser("keep")
+    keeping.add_argument("run", type=Path, help="folder of a run of tgdsl distill")
+    keeping.add_argument("name", help="NAME or SERIES__NETWORKS")
+    keeping.add_argument("--teacher", type=Path, help="file of tgdsl evaluate --policy TEACHER --out")
+    keeping.add_argument("--rest", type=Path, help="file of tgdsl evaluate --out without a policy")
+    actions.add_parser("page")
+    options = parser.parse_args()
     try:
-        given.run_it(given)
+        if options.action == "keep":
+            print(keep(options.run, options.name, {"teacher": options.teacher, "rest": options.rest}))
+        else:
+            print(*write_pages(), sep="\n")
     except TgdslError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+        sys.exit(str(error))
 
 
 if __name__ == "__main__":

@@ -15,13 +15,13 @@ from __future__ import annotations
 
 import argparse
 import io
+import json
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ablations_kept import read_json
 from ruamel.yaml import YAML
 
 from tgdsl.errors import TgdslError
@@ -126,7 +126,10 @@ def table(folder: Path) -> str:
         file = folder / f"{setting.name}.json"
         if not file.is_file():
             continue
-        found = read_json(file, "what tgdsl evaluate --out wrote")
+        try:
+            found = json.loads(file.read_text())
+        except ValueError as error:
+            raise TgdslError(f"{file}: {error}; expected a file of tgdsl evaluate --out") from error
         if found.get("task") != "hot_ball":
             raise TgdslError(f'{file}: an evaluation in "{found.get("task")}", expected one in "hot_ball"')
         if missing := {"score", "score_interval", "episodes"} - found.keys():

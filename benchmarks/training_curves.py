@@ -14,11 +14,11 @@ import io
 from pathlib import Path
 
 import numpy as np
-from ablations_kept import KeptError, read_rows
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from tgdsl.errors import TgdslError
 from tgdsl.files.write import atomic_write, with_folder
 
 ROOT = Path(__file__).parents[1]
@@ -77,12 +77,14 @@ def keep(run: Path, name: str) -> Path:
     """Write a thinned copy of a run's curve; return its file.
 
     Raises:
-        KeptError: If there is no curve; nothing is written.
+        OSError: If there is no curve; nothing is written.
+        TgdslError: If a column is missing; the same.
     """
     file = run / "curve.csv"
-    rows = read_rows(file)
+    with file.open(newline="") as lines:
+        rows = list(csv.DictReader(lines))
     if missing := sorted({"iteration", "samples", "seconds", "episodes"} - rows[0].keys()):
-        raise KeptError(f"{file}: there is no column {missing[0]}: this is not what tgdsl train writes")
+        raise TgdslError(f"{file}: there is no column {missing[0]}: this is not what tgdsl train writes")
     names, size = [column for column in COLUMNS if column in rows[0]], -(-len(rows) // ROWS)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -130,7 +132,7 @@ def main() -> None:
     if options.keep is not None:
         try:
             print(keep(options.keep, options.name))
-        except KeptError as error:
+        except (OSError, TgdslError) as error:
             parser.error(str(error))
     figure = Figure(figsize=(10, 3 * len(PANELS)), dpi=100)
     for (title, runs), pair in zip(PANELS.items(), figure.subplots(len(PANELS), 2), strict=True):

@@ -9,7 +9,8 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 import training_curves
-from ablations_kept import KeptError
+
+from tgdsl.errors import TgdslError
 
 
 def test_a_curve_is_thinned_to_means_over_equal_numbers_of_iterations(tmp_path, monkeypatch):
@@ -40,9 +41,9 @@ def test_a_curve_is_thinned_to_means_over_equal_numbers_of_iterations(tmp_path, 
 def test_a_missing_or_invalid_curve_leaves_the_kept_one(tmp_path, monkeypatch):
     monkeypatch.setattr(training_curves, "KEPT", tmp_path)
     (tmp_path / "run.csv").write_text("kept")
-    for text, message in ((None, r"curve\.csv: cannot read this file"), ("iteration,seconds\n1,2\n", "no column episodes")):
+    for text, message in ((None, r"curve\.csv"), ("iteration,seconds\n1,2\n", "no column episodes")):
         if text is not None:
             (tmp_path / "curve.csv").write_text(text)
-        with pytest.raises(KeptError, match=message):
+        with pytest.raises((OSError, TgdslError), match=message):
             training_curves.keep(tmp_path, "run")
     assert (tmp_path / "run.csv").read_text() == "kept"
