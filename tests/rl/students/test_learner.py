@@ -252,6 +252,46 @@ def test_a_distillation_resumes_to_the_bit(make, tmp_path):
         assert torch.equal(rollout.x, twin.x)
 
 
+def test_the_teacher_acts_in_a_warm_start(make, tmp_path):
+    """In the run's first iterations, also of a resumed run; it has no noise, and its scores are not the students'."""
+    options = {"types": ("depth", "none"), "placements": ("ends",), "num_envs": 24, "warm_start": 2, "std": 0.1}
+    distiller, resumed, file = make(**options), make(**options), tmp_path / "checkpoint.pt"
+    records = []
+    for each in (distiller, resumed):
+        step = each.env.step
+
+        def recording_step(action, each=each, step=step):
+            records.append((action.clone(), each._label.clone(), each._action.clone()))
+            return step(action)
+
+        each.env.step = recording_step
+    iterations = [distiller.iterate()]
+    write_checkpoint(state_of(distiller, 1.0), file)
+    restore(resumed, read_checkpoint(file), file)
+    iterations += [resumed.iterate() for _ in range(2)]
+    assert all(iteration.episodes for iteration in iterations)
+    for number, (action, label, students_action) in enumerate(records):
+        assert torch.equal(action, label if number < 2 * 4 else students_action) and not torch.equal(label, students_action)
+    scores = [[name for name in iteration.metrics if name.startswith("Score/")] for iteration in iterations]
+    assert not scores[0] and not scores[1] and scores[2]
+
+
+@pytest.mark.parametrize("last", [None, 1e-5])
+def test_one_cycle_of_the_learning_rate_equals_torchs(make, last):
+    """Torch counts steps from 0 to `total_steps` − 1; its rise then ends at 30 % of them."""
+    distiller, total, rate = make(types=("none",), schedule="one_cycle", final_learning_rate=last or "null"), 51, 1e-3
+    optimiser = torch.optim.Adam([torch.zeros(1)], lr=rate)
+    factors = {"pct_start": (0.3 * (total - 1) + 1) / total, "final_div_factor": rate / 25 / last if last else 1e4}
+    expected = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total, **factors)
+    for step in range(total):
+        distiller.set_rate(step / (total - 1))
+        rates = [group["lr"] for each in (distiller.rollouts[0].stack.optimiser, optimiser) for group in each.param_groups]
+        assert rates[0] == pytest.approx(rates[1], rel=1e-12)
+        optimiser.step()
+        if step < total - 1:
+            expected.step()
+
+
 def test_a_checkpoint_of_other_students_is_refused(make, tmp_path):
     one = make()
     one.iterate()

@@ -19,6 +19,7 @@ Shapes: `env` environments, `student` students of a stack, `row` environments of
 
 from __future__ import annotations
 
+import math
 import random
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -72,6 +73,17 @@ def decoder_error(
 ) -> Float[Tensor, " student"]:
     """Return the weighted error of the decoders; zeros if there are none."""
     return ((output - scales * targets).square().mean(dim=1) * weights).sum(dim=1)
+
+
+RISE, START, END = 0.3, 1 / 25, 1 / 25e4  # one cycle: the share of its rise; its first and last rate, relative to the largest
+
+
+def one_cycle(highest: float, last: float | None, share: float) -> float:
+    """Return the learning rate at a finished share of the run, with torch's defaults of `OneCycleLR`."""
+    start, end, part = highest * START, highest, share / RISE
+    if share > RISE:
+        start, end, part = highest, highest * END if last is None else last, (share - RISE) / (1.0 - RISE)
+    return end + (start - end) * 0.5 * (1.0 + math.cos(math.pi * part))
 
 
 LEAST_STD = 1e-3  # least deviation of the teacher's actions that divides an error
@@ -156,15 +168,23 @@ class Distiller(Learning):
         """Numbers of the episodes that ended, from iterations in which any did."""
         return [*super().episode_names, *(f"Score/{key.name}" for key in self.keys)]
 
+    @property
+    def is_warming_up(self) -> bool:
+        """Whether the teacher acts in this iteration."""
+        return self.iteration < self._spec.warm_start
+
     def set_rate(self, share: float) -> None:
         """Set the learning rate for the finished share of the run."""
         first, last = self._spec.learning_rate, self._spec.final_learning_rate
-        self._rate = first if last is None else first * (last / first) ** share
+        if self._spec.schedule == "one_cycle":
+            self._rate = one_cycle(first, last, share)
+        else:
+            self._rate = first if last is None else first * (last / first) ** share
         for each in self.rollouts:
             each.stack.set_rate(self._rate)
 
     def __call__(self, obs: Mapping[str, Tensor]) -> Tensor:
-        """Return the students' actions; store actions, observations and the teacher's actions."""
+        """Return the students' actions, or the teacher's in a warm start; store both, and the observations."""
         copy_each(list(self._seen.values()), [obs[name] for name in self._seen])
         self._chosen()
         t = self._step
@@ -175,7 +195,7 @@ class Distiller(Learning):
         if self._targets:
             privileged = self.env.task.decoded(self.env.now)
             self._privileged[t].copy_(torch.stack([privileged[name] for name in self._targets], dim=1))
-        return self._action
+        return self._label if self.is_warming_up else self._action
 
     def begin(self, ended: Bool[Tensor, " env"]) -> None:
         for each in self.rollouts:
@@ -285,7 +305,8 @@ class Distiller(Learning):
     def _keep(self, moment: Moment) -> None:
         info = moment.step.info
         self._ended[self._step].copy_(info.ended)
-        self._scores += torch.where(info.ended, torch.stack([torch.ones_like(info.score), info.score]).double(), 0.0)
+        if not self.is_warming_up:
+            self._scores += torch.where(info.ended, torch.stack([torch.ones_like(info.score), info.score]).double(), 0.0)
         self._step += 1
 
     def _update(self) -> None:

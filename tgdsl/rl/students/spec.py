@@ -8,9 +8,9 @@ all links.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import StrictBool, model_validator
+from pydantic import Field, StrictBool, StrictInt, model_validator
 
 from tgdsl.fields.models import NonNegative, Positive, SpecModel
 from tgdsl.rl.train.spec import WIDTHS, EncoderSpec, Groups, Time, TouchEncoderSpec, Whole, Widths
@@ -74,16 +74,21 @@ class DistillSpec(SpecModel):
     """Control steps of each environment per iteration: a multiple of `gradient_length`."""
     gradient_length: Whole = 2
     """Control steps of a gradient step, through which recurrent networks are differentiated."""
+    warm_start: Annotated[StrictInt, Field(ge=0)] = 0
+    """Iterations at the start of the run in which the teacher acts, not the students. They have no scores of students."""
     epochs: Whole = 5
     """Passes of an update through its rollout."""
     aggregate: Whole = 1
     """Number of latest rollouts that updates learn from, as DAgger aggregates its data: the first pass uses the latest one,
     each other pass a random one; 1: the latest alone. A resumed run gathers them from scratch."""
     learning_rate: Positive = 1e-4
-    """Learning rate; with `final_learning_rate`, the initial one."""
+    """Learning rate, the largest of its schedule."""
+    schedule: Literal["geometric", "one_cycle"] = "geometric"
+    """Learning rate by the finished share of iterations or of minutes, whichever is larger, including earlier starts of the
+    run. `geometric`: a decay from the start. `one_cycle`: half a cosine up from learning_rate/25 in the first 30 %, then half a
+    cosine down."""
     final_learning_rate: Positive | None = None
-    """Final learning rate of a geometric decay with the finished share of iterations or of minutes, whichever is larger,
-    including earlier starts of the run; null: constant."""
+    """Learning rate at the end; null: that of the start for `geometric`, learning_rate/25e4 for `one_cycle`."""
     max_grad_norm: Positive | None = 2.0
     """Largest norm of each student's gradient; null: no bound."""
     loss: Loss = "mse"
