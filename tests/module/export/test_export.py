@@ -63,7 +63,8 @@ def of_kinds(folder: Path, *names: str) -> tgdsl.TactileModule:
     return every_kind(folder, sensors)
 
 
-def test_a_file_computes_the_same_as_the_module(noisy, tmp_path):
+@pytest.mark.slow
+def test_a_file_with_all_noise_computes_the_same_as_the_module(noisy, tmp_path):
     """All kinds of noise, delays, rates, histories, observations and resets; batches of 1, 7 and 64; without importing tgdsl."""
     noisy(felt_state(noisy))
     signature = noisy.export(tmp_path / "hand.pt2", dt=0.01)
@@ -77,6 +78,13 @@ def test_a_file_computes_the_same_as_the_module(noisy, tmp_path):
         Verify(tmp_path / "hand.pt2").run()
 
 
+def test_a_file_computes_the_same_as_the_module(brief):
+    touch, file, _ = brief
+    verdict = verify(file, touch, num_calls=3)
+    assert list(verdict.differences) == [1, 7, 64] and verdict.worst <= 1e-6 and verdict.is_equal
+
+
+@pytest.mark.slow
 def test_other_random_numbers_are_detected(brief):
     touch, file, _ = brief
     other = verify(file, tgdsl.TactileModule(touch.plan).seed(12), num_calls=3)
