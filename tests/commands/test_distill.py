@@ -5,6 +5,7 @@ import json
 import shutil
 import sys
 
+import numpy as np
 import pytest
 import torch
 from felt_tasks import felt_task
@@ -14,7 +15,10 @@ from tgdsl.commands.distill import _warn_unlike
 from tgdsl.commands.sweep import run_trial
 from tgdsl.commands.sweep_document import Trial
 from tgdsl.errors import FileError
+from tgdsl.layout.layout import Link
+from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
+from tgdsl.rl.sensors import compile_sensors
 from tgdsl.rl.students.results import Row
 from tgdsl.rl.train.folder import read_checkpoint
 from tgdsl.rl.train.run import Run
@@ -69,8 +73,8 @@ def fails(here, base):
 
 
 def test_from_a_teacher_to_students_that_play(base, here):
-    """A student's file can be evaluated in its task; a resumed run has the same students."""
-    arguments = ("--envs", "10", "--iterations", "2", "--episodes", "2", *SMALL)
+    """A student's file can be evaluated in its task; a resumed run has the same students, with their gates."""
+    arguments = ("--envs", "10", "--iterations", "2", "--episodes", "2", "--set", "distill.gates={taxels: 3}", *SMALL)
     code, out, error = here(base, "distill", "task.yaml", *TEACHER, *FIVE, *arguments)
     assert code == 0, error
     assert out.splitlines()[0] == "5 students in 3 stacks, 10 environments: out/task_students/default"
@@ -85,6 +89,8 @@ def test_from_a_teacher_to_students_that_play(base, here):
     assert float(rows[0]["score"]) == evaluation["depth-ends-clean-s0"]["score"]
     card = json.loads((folder / "default" / "students" / "depth-all-clean-s0.json").read_text())
     assert card["groups"] == {"proprio": 6, "tactile_sensors": 10, "goal": 7} and card["teacher"] == "teacher.pt"
+    assert len(card["gates"]) == 10 and all(0.9 < value < 1.0 for value in card["gates"]) and len(set(card["gates"])) > 1
+    assert "gates" not in json.loads((folder / "default" / "students" / "none-s0.json").read_text())
     names = [{file.stem for file in (folder / "default" / "students").glob(f"*.{ending}")} for ending in ("pt", "onnx")]
     assert names[0] == names[1] and len(names[0]) == 5
     student = ("--policy", "out/task_students/default/students/depth-all-clean-s0.pt", "--episodes", "2", "--envs", "2")
@@ -103,6 +109,44 @@ def test_from_a_teacher_to_students_that_play(base, here):
     assert [start["iteration"] for start in starts] == [0, 2]
     code, out, error = here(base, "distill", "task.yaml", "--resume", str(folder), "--types", "none", "--device", "cpu")
     assert code == 2 and "--types none: this run began with depth,bool,none; begin another one" in error
+
+
+def test_the_layout_of_a_student_has_the_taxels_of_its_widest_gates(base, here):
+    """A task with that layout sees just these taxels at `chosen`; its other groups of observations keep their sizes."""
+    gates = [0.2, 0.9, 0.0, 0.3, 1.0, 0.4, 0.0, 0.0, 0.0, 0.0]  # of six taxels on the finger, then four on its tip
+    overrides = {"touch": "depth", "placement": "all"}
+    task, seen = load_task(base / "task.yaml", overrides), ["proprio", "tactile_sensors"]
+    student = teacher(base / "student.pt", task, seen, gates=gates, overrides=overrides, task=str(base / "task.yaml"))
+    sensors = (base / "sensors.yaml").read_text()
+    head, tail = sensors.index("  layout:"), sensors.index("objects:")
+    (base / "chosen.yaml").write_text(f"{sensors[:head]}  layout: new/chosen.yaml\n{sensors[tail:]}")
+    before = compile_sensors(task, "cpu").groups["tactile_sensors"].layout
+    for options, rows in (((), [0, 1, 3, 4, 5]), (("--taxels", "3"), [1, 4, 5])):
+        code, out, error = here(base, "layout", "from-gates", str(student), "-o", "new/chosen.yaml", "--force", *options)
+        assert (code, out) == (0, "new/chosen.yaml\nnew/chosen.low.csv\n"), error
+        chosen = load_task(base / "task.yaml", {"touch": "depth", "placement": "chosen", "document": "chosen.yaml"})
+        after = compile_sensors(chosen, "cpu").groups["tactile_sensors"].layout
+        assert after.links == (Link("finger", "finger"),)
+        for name in ("pos", "normal", "tangent", "radius", "area", "cell"):
+            assert np.array_equal(getattr(after, name), getattr(before, name)[rows]), name
+    envs = [TouchEnv(each, 2, threads=1) for each in (task, chosen)]
+    assert envs[0].groups | {"tactile_sensors": 3} == envs[1].groups
+    for env in envs:
+        env.close()
+    refused = [
+        (("--taxels", "6"), "5 of 10 gates are open, not 6"),
+        (("--taxels", "0"), "--taxels 0: expected at least 1"),
+        (("-o", "new/chosen.yaml"), "new/chosen.yaml: this file is there already; give --force to replace it"),
+    ]
+    for options, message in refused:
+        code, _, error = here(base, "layout", "from-gates", str(student), *options)
+        assert code == 2 and message in error
+    (base / "sensors.yaml").write_text(sensors.replace("rows: 3, columns: 2", "rows: 2, columns: 3"))
+    code, _, error = here(base, "layout", "from-gates", str(student))
+    assert code == 2 and "student.pt: this policy feels with other taxels" in error
+    code, _, error = here(base, "layout", "from-gates", "teacher.pt")
+    assert code == 2 and "teacher.pt: this policy has no gates; teach a student with distill.gates" in error
+    assert not (base / "layout_gates.yaml").exists()
 
 
 def test_a_resumed_run_keeps_its_settings_and_prints_changes(base, here, monkeypatch):

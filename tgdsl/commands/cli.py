@@ -50,6 +50,7 @@ EXAMPLES = {
     "links": "xhand1",
     "layout new": "hand.urdf --density 4/cm2 -o layout.yaml",
     "layout freeze": "hand.yaml -o frozen.yaml",
+    "layout from-gates": "out/students/default/students/depth-hand-clean-s0.pt --taxels 40 -o layout_40.yaml",
     "import": "hand.usd -o hand.xml",
     "export-usd": "hand.xml -o hand.usda",
     "export": "hand.yaml --to onnx",

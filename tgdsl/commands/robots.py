@@ -127,10 +127,42 @@ class Freeze:
 
 
 @dataclass(frozen=True)
-class Layout:
-    """Propose a layout of taxels for a robot, or freeze one."""
+class FromGates:
+    """Write a student's layout with only the taxels that it has chosen by `distill.gates`, at its resolution.
 
-    action: Annotated[args.subcommands(New, Freeze), tyro.conf.arg(name="")]  # type: ignore[valid-type]
+    The new group `chosen` has the links with these taxels. The other links keep theirs, which other sensors may need.
+    """
+
+    policy: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="POLICY")]
+    """A student with gates, as `tgdsl distill` writes it; its card names the task's document."""
+    taxels: args.OptionalInt = None
+    """Number of taxels, the widest gates first; default: all open ones."""
+    out: args.Out = Path("layout_gates.yaml")
+    """The layout to write; its table is written next to it, such as layout_gates.med.csv."""
+    force: args.Replace = False
+
+    def run(self) -> None:
+        from tgdsl.placement.freeze import frozen_files
+        from tgdsl.rl.playing.policy import read_policy
+        from tgdsl.rl.students.results import chosen_layout
+
+        args.check_least(self, taxels=1)
+        args.refuse_to_replace(self.out, self.force)
+        saved = read_policy(self.policy)
+        with StatusLine() as progress:
+            spec, layouts = chosen_layout(saved, self.taxels, progress)
+        files = frozen_files(spec, layouts, self.out, saved.file.name)
+        for path in files:
+            args.refuse_to_replace(path, self.force)
+        atomic_write_all(files)
+        print("\n".join(map(str, reversed(files))))
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Propose a layout of taxels for a robot, freeze one, or choose taxels that a student needs."""
+
+    action: Annotated[args.subcommands(New, Freeze, FromGates), tyro.conf.arg(name="")]  # type: ignore[valid-type]
     """What to do."""
 
     def run(self) -> None:

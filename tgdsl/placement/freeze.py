@@ -18,7 +18,7 @@ from tgdsl.placement.sample.sample import CELL, REQUIRED, TANGENT
 from tgdsl.schema.placement import LayoutSpec
 
 _HEADER = """\
-# The taxels of {origin}, written by `tgdsl layout freeze`: they no longer depend on the robot's meshes or on sampling.
+# The taxels of {origin}, written by `tgdsl layout`: they no longer depend on the robot's meshes or on sampling.
 # The tables next to this file hold one taxel per row, in the link's body frame, in metres; do not reorder the rows.
 """
 _COLUMNS = ("link", *CELL, *REQUIRED, *TANGENT, "radius", "area")

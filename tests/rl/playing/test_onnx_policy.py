@@ -48,7 +48,8 @@ def test_a_teachers_onnx_equals_its_torchscript(tmp_path):
 
 def test_a_student_with_every_encoder_carries_its_memory_from_step_to_step(tmp_path):
     torch.manual_seed(3)
-    student = Student(Architecture(ENCODERS, (8,), 2, ((4,),)))
+    student = Student(Architecture(ENCODERS, (8,), 2, ((4,),), gates=(2, 7)))
+    torch.nn.init.uniform_(student.gates.weight, -0.2, 0.2)
     student.mean.normal_()
     student.var.uniform_(0.1, 4.0)
     write_onnx_policy(acting(student), {"card.json": "{}"}, tmp_path / "student.onnx")

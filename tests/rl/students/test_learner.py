@@ -123,7 +123,7 @@ def test_a_students_update_does_not_depend_on_others(make):
 
 def test_a_rollout_holds_inputs_actions_and_labels(make):
     """Compared with inputs, actions, labels and privileged numbers recorded at the environments."""
-    distiller, rows = make(), []
+    distiller, rows = make(gates="{taxels: 2}"), []
     step = distiller.env.step
 
     def recording_step(action):
@@ -232,7 +232,7 @@ def test_a_distillation_resumes_to_the_bit(make, tmp_path):
     One step comes first: decoders read the instant of a step, which a loaded state lacks.
     """
     options = {"types": ("depth", "none"), "placements": ("ends",), "networks__touch_kind": "convrnn"}
-    options |= {"std": 0.1, "max_grad_norm": 0.5, "decoders": "{object_size: {scale: 20}}"}
+    options |= {"std": 0.1, "max_grad_norm": 0.5, "decoders": "{object_size: {scale: 20}}", "gates": "{taxels: 2}"}
     one, other = make(**options), make(**options)
     for _ in range(2):
         one.iterate()
@@ -332,8 +332,10 @@ def test_students_learn_what_they_can_see(make):
 
 
 def test_metrics_of_an_iteration_are_per_block(make):
-    """Scores are means over the episodes that ended in the student's own environments."""
-    distiller = make()
+    """Scores are means over the episodes that ended in the student's own environments; gates are counted that are open."""
+    distiller = make(gates="{taxels: 2}")
+    with torch.no_grad():
+        distiller.rollouts[1].stack.parameters["gates.weight"][0, :3] = -1.0
     ended, scores, step = torch.zeros(10), torch.zeros(10), distiller.env.step
 
     def recording_step(action):
@@ -349,6 +351,9 @@ def test_metrics_of_an_iteration_are_per_block(make):
         block = slice(2 * i, 2 * i + 2)
         count = float(ended[block].sum())
         assert metrics.get(f"Score/{key.name}") == (pytest.approx(float(scores[block].sum()) / count) if count else None)
+        gates = distiller.student(i).gates
+        assert metrics.get(f"Gates/{key.name}") == (int((gates.values() > 0.0).sum()) if gates else None)
+    assert (metrics["Gates/depth-all-clean-s0"], metrics["Gates/bool-all-clean-s0"]) == (7.0, 10.0)
 
 
 def test_evaluating_blocks_equals_evaluating_one_policy(make):
@@ -388,6 +393,12 @@ def test_errors_in_the_document_are_located(make):
     message = 'there is no group of observations "propio"; did you mean "proprio"?'
     with pytest.raises(SpecError, match=r"distill\.groups\[0\]: " + re.escape(message)):
         make(groups="[propio]")
+    for types, problem in (
+        (("none",), "no student has touch"),
+        (("depth", "agg_force"), "agg_force see no numbers of each taxel"),
+    ):
+        with pytest.raises(SpecError, match=rf"distill\.gates: .*{problem}"):
+            make(types=types, gates="{taxels: 2}")
     with pytest.raises(SpecError, match="steps is 5, expected a multiple of gradient_length, 2"):
         make(steps=5)
     with pytest.raises(SpecError, match="kernel is 2, expected an odd number"):

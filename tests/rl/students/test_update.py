@@ -1,5 +1,6 @@
 """An update of a stack, against students trained one by one in plain torch, in float64."""
 
+import itertools
 import math
 import random
 from functools import partial
@@ -41,12 +42,13 @@ class Chosen(NamedTuple):
     aggregate: int = 1
     final_learning_rate: float | None = None
     normalise: bool = False
+    gates: int | None = None
 
 
 CHOSEN = {
     "plain": Chosen(),
-    "huber": Chosen("huber", clip=0.02, normalise=True, final_learning_rate=1e-4),
-    "all": Chosen("inverse_variance", clip=0.02, max_grad_norm=4.0, num_decoders=2, aggregate=2),
+    "huber": Chosen("huber", clip=0.02, normalise=True, final_learning_rate=1e-4, gates=1),
+    "all": Chosen("inverse_variance", clip=0.02, max_grad_norm=4.0, num_decoders=2, aggregate=2, gates=2),
 }
 
 
@@ -64,8 +66,8 @@ class Lesson(NamedTuple):
 class Alone:
     """A student trained separately."""
 
-    def __init__(self, student: Student, chosen: Chosen):
-        self.student, self.chosen = student, chosen
+    def __init__(self, student: Student, number: int, chosen: Chosen):
+        self.student, self.number, self.chosen = student, number, chosen
         self.optimiser = torch.optim.Adam(student.parameters(), lr=RATE)
         self.seen: list[Tensor] = []
         self.label_std: Tensor | None = None  # over all of the teacher's actions so far
@@ -92,9 +94,9 @@ class Alone:
         old_actions = lesson.before if is_latest else self.acted(lesson)
         memory, errors = lesson.begun, []
         for first in range(0, STEPS, LENGTH):
-            behaviour, decoded = [], []
+            behaviour, decoded, noise = [], [], gate_noise(self.number, len(self.norms)) if self.student.gates else None
             for t in range(first, first + LENGTH):
-                action, numbers, memory = self.student(lesson.x[t], memory)
+                action, numbers, memory = self.student(lesson.x[t], memory, noise)
                 memory = memory * ~lesson.ended[t][:, None]
                 behaviour.append(self.behaviour(action, lesson.label[t], old_actions[t]).mean())
                 for k in range(self.chosen.num_decoders):
@@ -102,13 +104,20 @@ class Alone:
                     decoded.append(WEIGHTS[k] * off.square().mean())
             error = torch.stack(behaviour).mean()
             self.optimiser.zero_grad()
-            (error + sum(decoded) / LENGTH).backward()
+            (error + sum(decoded) / LENGTH + self.penalty()).backward()
             norm = torch.nn.utils.clip_grad_norm_(self.student.parameters(), self.chosen.max_grad_norm or torch.inf)
             self.norms.append(float(norm))
             self.optimiser.step()
             memory = memory.detach()
             errors.append(float(error.detach()))
         return fmean(errors)
+
+    def penalty(self) -> Tensor | float:
+        """Return the loss of open gates."""
+        if self.student.gates is None:
+            return 0.0
+        is_open = torch.sigmoid(20.0 * self.student.gates.weight - 2 / 3 * math.log(0.1 / 1.1))
+        return 0.5 * torch.clamp(is_open.sum() - (self.chosen.gates or 0), min=0.0) / len(is_open)
 
     def behaviour(self, action: Tensor, label: Tensor, before: Tensor) -> Tensor:
         """Return the error of each action."""
@@ -135,6 +144,11 @@ class Alone:
         self.student.var.copy_(rows.var(dim=0, correction=0))
 
 
+def gate_noise(student: int, step: int) -> Tensor:
+    """Return the noise of a student's four gates in a gradient step."""
+    return torch.randn(4, generator=torch.Generator().manual_seed(1000 * student + step))
+
+
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     """Return the task's document and a teacher."""
@@ -158,6 +172,7 @@ def make(files, monkeypatch):
         spec |= {"loss": chosen.loss, "aggregate": chosen.aggregate, "normalise": chosen.normalise}
         spec |= {name: getattr(chosen, name) or "null" for name in ("clip", "max_grad_norm", "final_learning_rate")}
         spec["decoders"] = "{" + ", ".join(named[: chosen.num_decoders]) + "}"
+        spec["gates"] = "null" if chosen.gates is None else f"{{taxels: {chosen.gates}, weight: 0.5}}"
         widths = {"encoder.hidden": "[5]", "encoder.size": 4, "hidden": "[8]", "touch_encoder.hidden": "[6]"}
         widths |= {"touch_encoder.size": 6, "convolution.channels": "[2]"} | KINDS[kind]
         spec |= {f"networks.{name}": value for name, value in widths.items()}
@@ -166,6 +181,13 @@ def make(files, monkeypatch):
         student_teacher = Teacher(file, loaded)
         envs.append(TouchEnv(loaded, ROWS * len(keys), seed=1, threads=1, touches=touches(keys, student_teacher.touch)))
         bound = student_teacher.bound(envs[-1])
+        steps = itertools.count()  # only the stack of both types of touch has gates
+
+        def noise_like(log_alpha: Tensor) -> Tensor:
+            step = next(steps)
+            return torch.stack([gate_noise(student, step) for student in range(len(log_alpha))])
+
+        monkeypatch.setattr(learner, "noise_like", noise_like)
         monkeypatch.setattr(learner, "Stack", partial(Stack, dtype=torch.float64))
         torch.set_default_dtype(torch.float64)
         return Distiller(envs[-1], loaded, bound, keys, 0)
@@ -208,7 +230,7 @@ def test_an_update_equals_that_of_separate_students(make, kind, chosen):
     options = CHOSEN[chosen]
     distiller, generator, chance = make(kind, options), torch.Generator().manual_seed(0), random.Random(5)
     distiller._chance.seed(5)
-    alone = [Alone(distiller.student(i), options) for i in range(len(distiller.keys))]
+    alone = [Alone(distiller.student(i), i, options) for i in range(len(distiller.keys))]
     recent: list[list[Lesson]] = []
     labels: list[Tensor] = []
     for number in range(NUM_UPDATES):

@@ -120,16 +120,23 @@ def seen_by(key: StudentKey, names: Sequence[str]) -> list[str]:
 
 def architecture(loaded: LoadedTask, env: TouchEnv, key: StudentKey, names: Sequence[str]) -> Architecture:
     """Return a student's networks: students with equal networks are stacked."""
-    networks, parts = loaded.spec.distill.networks, []
-    for name in seen_by(key, names):
+    networks, parts, gates = loaded.spec.distill.networks, [], None
+    for place, name in enumerate(seen_by(key, names)):
         size = env.groups[name]
         if key.touch is not None and name == key.touch.group:
-            encoder = _touch_encoder(networks, key.touch, env.touch_sources[name].layout, size)
+            source = env.touch_sources[name]
+            encoder = _touch_encoder(networks, key.touch, source.layout, size)
+            if loaded.spec.distill.gates is not None:
+                rows = next(output.rows for output in env.touch.outputs if output.name == source.spec.of)
+                if key.touch.is_per_link or rows != "taxel":
+                    problem = f"students with {key.touch.type} see no numbers of each taxel, which gates multiply"
+                    raise loaded.error(("distill", "gates"), problem, "leave them out of --types")
+                gates = place, source.layout.num_taxels
         else:
             encoder = Encoder(networks.kind, networks.encoder.hidden, networks.encoder.size)
         parts.append((size, encoder))
     heads = tuple(decoder.hidden for decoder in loaded.spec.distill.decoders.values())
-    return Architecture(tuple(parts), networks.hidden, env.num_actions, heads, networks.eps, networks.clip)
+    return Architecture(tuple(parts), networks.hidden, env.num_actions, heads, gates, networks.eps, networks.clip)
 
 
 def _touch_encoder(networks: StudentNetworksSpec, touch: PolicyTouch, layout: Layout, size: int) -> Encoder:

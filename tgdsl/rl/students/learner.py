@@ -9,6 +9,7 @@ of the pass), a_c = a_0 + clamp(a_s − a_0, ±clip), and h(e) = e², or for `hu
 
     action error     mean of h((a_s − a_t)/σ_t);  with a clip, of max(h((a_s − a_t)/σ_t), h((a_c − a_t)/σ_t))
     decoder k        w_k · mean of (d_k − s_k y_k)²,  y_k being the privileged number
+    gates            the penalty of `gates.py`
 
 Source: Chung et al., *Tactile Genesis*, appendix. It names the loss, "inv-var MSE", and a clip parameter of 0.1; the formulas
 are ours: σ_t² as the variance, and the clip as PPO bounds values. Normalised actions and Huber's loss follow the authors'
@@ -35,6 +36,7 @@ from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.playing.policy import Policy
 from tgdsl.rl.playing.rollout import Actor, Moment
+from tgdsl.rl.students.gates import noise_like, openings, penalty
 from tgdsl.rl.students.keys import StudentKey, architecture, groups_of, seen_by
 from tgdsl.rl.students.spec import DistillSpec
 from tgdsl.rl.students.student import Architecture, Stack, Student, forgotten
@@ -157,6 +159,8 @@ class Distiller(Learning):
             first, rows = self.rollouts[-1].envs.stop if self.rollouts else 0, env.num_envs // len(keys)
             seen = [seen_by(key, names) for key in members]
             self.rollouts.append(Rollout(networks, members, seen, first, rows, self._spec, env.device))
+        if self._spec.gates is not None and all(networks.gates is None for networks in stacked):
+            raise loaded.error(("distill", "gates"), "no student has touch, so there are no taxels to choose")
         self.keys = [key for each in self.rollouts for key in each.keys]
         seen_groups = [groups for each in self.rollouts for groups in each.seen]
         self.groups = {key.name: list(groups) for key, groups in zip(self.keys, seen_groups, strict=True)}
@@ -270,13 +274,15 @@ class Distiller(Learning):
         detached = total = torch.zeros(len(rollout.keys), device=memory.device)
         parts = [steps] if rollout.stack.memory == 0 else [slice(t, t + 1) for t in range(steps.start, steps.stop)]
         with torch.enable_grad():
+            log_alpha = rollout.stack.log_alpha
+            noise = None if log_alpha is None else noise_like(log_alpha)
             for part in parts:  # without memory all steps are rows
                 x, target = (joined(values[part]) for values in (rollout.x, rollout.before))
                 label, targets, ended = (
                     joined(rollout.split(values[part], 1))
                     for values in (self._labels, self._privileged, self._ended[..., None])
                 )
-                outputs = rollout.stack(x, memory if rollout.stack.memory else x[..., :0])
+                outputs = rollout.stack(x, memory if rollout.stack.memory else x[..., :0], noise)
                 error = action_error(outputs.action, label, target, self._std, spec.clip, is_huber=spec.loss == "huber") / len(
                     parts
                 )
@@ -285,6 +291,8 @@ class Distiller(Learning):
                 if self._targets:
                     total = total + decoder_error(outputs.decoded, targets, self._scales, self._weights) / len(parts)
                 memory = forgotten(outputs.memory, ended[..., 0]) if rollout.stack.memory else memory
+            if spec.gates is not None and log_alpha is not None:
+                total = total + spec.gates.weight * penalty(log_alpha, spec.gates.taxels)
             rollout.stack.descend(total)
         return detached, memory.detach()
 
@@ -334,6 +342,10 @@ class Distiller(Learning):
         numbers = {"Loss/learning_rate": torch.tensor(self._rate, dtype=torch.float64, device=score.device)}
         for key, mean, loss in zip(self.keys, score / ended, (self._losses / updates).double(), strict=True):
             numbers |= {f"Score/{key.name}": mean, f"Loss/{key.name}": loss}
+        for rollout in self.rollouts:
+            if (log_alpha := rollout.stack.log_alpha) is not None:
+                num_open = (openings(log_alpha) > 0.0).sum(dim=1).double()
+                numbers |= {f"Gates/{key.name}": num for key, num in zip(rollout.keys, num_open, strict=True)}
         return numbers
 
     def _allocate(self) -> None:

@@ -1,4 +1,4 @@
-"""Results of students: a policy file each, and a table of their scores.
+"""Results of students: a policy file each, a table of their scores, and the layout of the taxels that one has chosen.
 
 An interval over seeds and episodes is the wider one of two: Student's, of the seeds' means, which vary by both but are few; and
 the interval of all episodes, as if seeds made no difference.
@@ -10,6 +10,7 @@ import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
+from glob import escape
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
@@ -17,16 +18,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import t as student_t
 
+from tgdsl.compiler.pipeline import all_layouts
 from tgdsl.console.progress import Progress
 from tgdsl.console.tables import text_table
+from tgdsl.fields.models import Selection
 from tgdsl.files.write import atomic_write, with_folder
-from tgdsl.rl.load import LoadedTask
+from tgdsl.layout.layout import Layout
+from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.playing.evaluation import Evaluation
-from tgdsl.rl.playing.policy import card_texts, write_onnx_policy, write_policy
+from tgdsl.rl.playing.policy import PolicyError, PolicyFile, card_texts, check_card, write_onnx_policy, write_policy
 from tgdsl.rl.sensors import GROUP, PolicyTouch, compile_sensors
 from tgdsl.rl.students.keys import StudentKey, own_task
 from tgdsl.rl.students.learner import Distiller
 from tgdsl.rl.students.student import acting, deployed
+from tgdsl.schema.placement import LayoutSpec
 
 
 class Row(NamedTuple):
@@ -121,6 +126,39 @@ def write_students(
         card = distiller.card(run, seconds, command, sizes)
         card["samples"] = distiller.samples // len(distiller.keys)
         card |= {"teacher": origin["teacher"], "score": evaluations[i].plain() if evaluations else None}
-        network, texts = acting(distiller.student(i)), card_texts(touch, card)
+        network = acting(distiller.student(i))
+        if network.student.gates is not None:
+            card["gates"] = network.student.gates.values().tolist()
+        texts = card_texts(touch, card)
         write_policy(deployed(network), texts, folder / f"{key.name}.pt")
         write_onnx_policy(network, texts, folder / f"{key.name}.onnx")
+
+
+CHOSEN = "chosen"  # the group of links with chosen taxels
+
+
+def chosen_layout(saved: PolicyFile, taxels: int | None, progress: Progress) -> tuple[LayoutSpec, dict[str, Layout]]:
+    """Return a student's layout with the taxels of its widest gates alone (None: of all open ones), at its resolution.
+
+    Links without any are left as they are, as other sensors and the teacher may need them; the others are a group.
+    """
+    card, file = saved.card or {}, saved.file
+    if "gates" not in card:
+        raise PolicyError(f"{file}: this policy has no gates; teach a student with distill.gates")
+    gates = np.array(card["gates"])
+    num_open = int((gates > 0.0).sum())
+    if not num_open or (taxels or 0) > num_open:
+        raise PolicyError(f"{file}: {num_open} of {len(gates)} gates are open" + (f", not {taxels}" if taxels else ""))
+    loaded = load_task(card["task"], card["overrides"])
+    sensors = compile_sensors(loaded, "cpu", progress)
+    check_card(saved, card["joints"], sensors.touch)
+    name, touch = sensors.touch.plan.origin.resolution, sensors.groups[GROUP].layout
+    spec, layouts = all_layouts(loaded.folder / loaded.spec.document, {}, [name])
+    layout = layouts[name]
+    widest = np.argsort(-gates, kind="stable")[: taxels or num_open]
+    chosen = layout.taxels_of(tuple(link.name for link in touch.links))[widest]
+    on_chosen_links = np.isin(layout.link_id, layout.link_id[chosen])
+    kept = np.union1d(chosen, np.flatnonzero(~on_chosen_links))
+    links = tuple(escape(layout.links[i].name) for i in np.unique(layout.link_id[chosen]))
+    update = {"groups": {**spec.groups, CHOSEN: Selection(include=links)}, "resolutions": {name: spec.resolutions[name]}}
+    return spec.model_copy(update=update), {name: layout.take(kept)}

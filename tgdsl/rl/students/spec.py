@@ -65,6 +65,15 @@ class StudentNetworksSpec(SpecModel):
     """Bound of normalised observations."""
 
 
+class GatesSpec(SpecModel):
+    """Gates on taxels, which close until about a number is left: a student learns which taxels it needs."""
+
+    taxels: Whole
+    """Number of gates that may stay open."""
+    weight: NonNegative = 1.0
+    """Loss of each further gate, times the number of taxels."""
+
+
 class DistillSpec(SpecModel):
     """Training of students."""
 
@@ -110,6 +119,8 @@ class DistillSpec(SpecModel):
     """Networks."""
     decoders: dict[str, DecoderSpec] = {}
     """Heads by the privileged number that they predict: see the task."""
+    gates: GatesSpec | None = None
+    """Gates on the taxels of touch; null: none."""
     precision: Literal["float32", "tf32"] = "tf32"
     """Precision of a GPU's matrix products: `float32` or `tf32`."""
     checkpoint: Time = 10.0

@@ -24,6 +24,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
 
+from tgdsl.rl.students.gates import SCALE, Gates
 from tgdsl.rl.train.model import Normalisation
 
 Kind = Literal["mlp", "lstm", "cnn", "convrnn"]
@@ -186,6 +187,7 @@ class Architecture:
     hidden: tuple[int, ...]  # widths of the hidden layers that follow the embeddings
     actions: int  # number of joints
     heads: tuple[tuple[int, ...], ...] = ()  # widths of the hidden layers of each decoder
+    gates: tuple[int, int] | None = None  # the group whose taxels have gates, by its place, and the number of taxels
     eps: float = 1e-5  # offset of the standard deviation that normalises an observation
     clip: float = 10.0  # bound of normalised observations
 
@@ -219,11 +221,15 @@ class Student(nn.Module):
         latent = sum(encoder.size for _, encoder in architecture.groups)
         self.trunk = mlp(latent, architecture.hidden, architecture.actions)
         self.decoders = nn.ModuleList([mlp(latent, hidden, 1) for hidden in architecture.heads])
+        self.gates = Gates(architecture.gates[1]) if architecture.gates else None
 
-    def forward(self, x: Tensor, memory: Tensor) -> StudentOutput:
+    def forward(self, x: Tensor, memory: Tensor, noise: Tensor | None = None) -> StudentOutput:
         architecture = self.architecture
         normal = ((x - self.mean) / (self.var.sqrt() + architecture.eps)).clamp(-architecture.clip, architecture.clip)
-        parts = normal.split([size for size, _ in architecture.groups], dim=1)
+        parts = list(normal.split([size for size, _ in architecture.groups], dim=1))
+        if architecture.gates and self.gates is not None:
+            place, _ = architecture.gates
+            parts[place] = self.gates(parts[place], noise)
         memories = memory.split([encoder.memory for encoder in self.encoders], dim=1)  # pyright: ignore
         embeddings = [encoder(*each) for encoder, *each in zip(self.encoders, parts, memories, strict=True)]
         latent, memory = (torch.cat(each, dim=1) for each in zip(*embeddings, strict=True))
@@ -297,6 +303,7 @@ def forgotten(memory: Tensor, ended: Tensor) -> Tensor:
     return torch.where(ended[..., None], 0.0, memory)
 
 
+GATES = "gates.weight"  # name of the gates' weights among a student's
 NORM_EPS = 1e-6  # offset of a norm in `torch.nn.utils.clip_grad_norm_`
 
 
@@ -327,11 +334,21 @@ class Stack:
         self.moments = {"mean": self.seen._mean[0], "var": self.seen._var[0]}
         self._shape = copy.deepcopy(students[0]).to("meta")
         self.optimiser = torch.optim.Adam(list(self.parameters.values()), **self._options())
-        self._called: Any = vmap(self._call)
 
-    def __call__(self, x: Float[Tensor, "student row feature"], memory: Float[Tensor, "student row memory"]) -> StudentOutput:
+    def __call__(
+        self,
+        x: Float[Tensor, "student row feature"],
+        memory: Float[Tensor, "student row memory"],
+        noise: Float[Tensor, "student taxel"] | None = None,
+    ) -> StudentOutput:
         """Return each student's output for its rows: (student, row, …)."""
-        return StudentOutput(*self._called(self.parameters, self.buffers, x, memory))
+        called: Any = vmap(self._call, (0, 0, 0, 0, None if noise is None else 0))
+        return StudentOutput(*called(self.parameters, self.buffers, x, memory, noise))
+
+    @property
+    def log_alpha(self) -> Float[Tensor, "student taxel"] | None:
+        """Openness of the gates; None without gates."""
+        return SCALE * self.parameters[GATES] if GATES in self.parameters else None
 
     def descend(self, losses: Float[Tensor, " student"]) -> None:
         """Take one step of Adam, each student by its loss."""
@@ -405,8 +422,8 @@ class Stack:
         is_cuda = self.seen.count.is_cuda
         return {"lr": self._rate, "capturable": is_cuda, "fused": True if is_cuda else None}
 
-    def _call(self, parameters: dict[str, Tensor], buffers: dict[str, Tensor], x: Tensor, memory: Tensor) -> tuple[Tensor, ...]:
-        return tuple(functional_call(self._shape, (parameters, buffers), (x, memory)))
+    def _call(self, parameters: dict[str, Tensor], buffers: dict[str, Tensor], *inputs: Tensor | None) -> tuple[Tensor, ...]:
+        return tuple(functional_call(self._shape, (parameters, buffers), inputs))
 
 
 def seeded_student(architecture: Architecture, seed: int) -> Student:
