@@ -1,20 +1,20 @@
-"""The module alone on a GPU: time, error and bytes of every kind, by environments, taxels, objects, points and noise.
+"""Measure the module alone on a GPU: time, error and bytes of every kind, by environments, taxels, objects, points and noise.
 
-    python benchmarks/gpu.py artefacts out/gpu                              # where documents can be compiled
+    python benchmarks/gpu.py artefacts out/gpu                              # on any machine with tgdsl
     python benchmarks/gpu.py run out/gpu --out out/gpu.json --jobs 8        # on the machine with the GPU
-    python benchmarks/gpu.py guard out/gpu --jobs 8                         # the rows with a limit, against kept ratios
+    python benchmarks/gpu.py guard out/gpu --jobs 8                         # rows with a limit, against recorded ratios
     python benchmarks/gpu.py table out/gpu.json                             # for docs/background/performance.md
     python benchmarks/gpu.py plot out/gpu.json --out docs/images
     python benchmarks/gpu.py bytes out/gpu                                  # memory of every case, without a GPU
 
-`run` needs torch and what `tgdsl.load` needs, no more; `--device cpu --eager` tries it out without a GPU. Each case has a
-process of its own, `--jobs` of them at once, and they take turns on the GPU: see turns.py. Rows are printed and written as
-processes end.
+`run` needs only torch and the dependencies of `tgdsl.load`; `--device cpu --eager` tries it without a GPU. Each case runs in a
+separate process, `--jobs` at once, and processes take turns on the GPU: see turns.py. Rows are printed and written as processes
+end.
 
-Per row: first the error, float32 on the device in three calls in a row against a float64 module, over the largest magnitude of
-each channel. Then medians: of a replayed CUDA graph that holds calls on so many sets of inputs, state and readings that
-together they exceed the GPU's L2 cache; and of a call from Python, plain or replaying a graph, whose inputs rotate too. The
-copy ceiling is how long it takes to copy as many bytes as a call must move, in the same manner, by the faster of two kernels.
+The error compares three successive float32 calls on the device with a float64 module on the CPU, relative to the largest
+magnitude of each channel. Times are medians: of a replayed CUDA graph of calls on enough sets of inputs, state and readings to
+exceed the GPU's L2 cache; and of a call from Python, plain or replaying a graph, on rotating inputs. `copy` is the time to copy
+the bytes that a call must move, in the same way, by the faster of two kernels.
 """
 
 from __future__ import annotations
@@ -49,15 +49,15 @@ from tgdsl.module.state import SceneState
 from tgdsl.plan.plan import Plan
 
 ROTATED = 160e6
-"""Bytes that the sets of buffers have together: the L2 of an H200 holds 60 MB."""
+"""Total bytes of the sets of buffers: the L2 of an H200 holds 60 MB."""
 MOST_SETS = 256
 LONG = 1_000.0
-"""When to stop repeating [ms]."""
+"""Total time after which repeating stops [ms]."""
 SLOWER = 0.1
-"""By how much a row's ratio to the copy may exceed the kept one."""
+"""Relative excess of a row's ratio to the copy over the recorded one that `guard` accepts."""
 KEPT = Path(__file__).parents[1] / "docs" / "measured" / "gpu_guard.json"
 CALLS = 3
-"""Calls in a row whose readings are compared."""
+"""Successive calls whose readings are compared."""
 Tensors = dict[str, Tensor]
 Core = Callable[[Tensors, Tensors], Tensors]
 Arrays = Mapping[str, np.ndarray]
@@ -65,7 +65,7 @@ Arrays = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Bench:
-    """One case: its plan, and its code for all numbers of environments."""
+    """A case's plan, and code that serves every number of environments."""
 
     case: Case
     plan: Plan
@@ -74,7 +74,7 @@ class Bench:
 
     @classmethod
     def of(cls, case: Case, plan: Plan, turn: turns.Turn, options: argparse.Namespace) -> Bench:
-        """Load a plan; code is compiled at its first call, and takes the turn before it runs."""
+        """Prepare a case; its code is compiled at the first call, and takes the turn before it runs."""
         touch = TactileModule(plan).to(options.device)
         if options.eager:
             return cls(case, plan, touch.advance, touch.device)
@@ -82,7 +82,7 @@ class Bench:
         return cls(case, plan, touch.calls.of(touch.advance), touch.device)
 
     def module(self, graph: bool = False) -> TactileModule:
-        """Return a module that remembers nothing yet, with the case's code."""
+        """Return a module without memory, with the case's code."""
         touch = TactileModule(self.plan).to(self.device)
         touch.calls.compiled = {"advance": self.core}
         touch.calls.graphed = {"advance": Graphed(self.core)} if graph and self.device.type == "cuda" else {}
@@ -98,34 +98,34 @@ def states_of(case: Case, plan: Plan, num_envs: int, count: int, seed: int = 0) 
 
 
 def readings_of(touch: TactileModule, states: Sequence[SceneState]) -> Arrays:
-    """Return the readings of a module in calls in a row, (call, env, …)."""
+    """Return the readings of successive calls of a module, (call, env, …)."""
     calls = [{name: value.double().cpu().numpy() for name, value in touch(state).items()} for state in states]
     return {name: np.stack([call[name] for call in calls]) for name in calls[0]}
 
 
-def full_scale_errors(outputs: Sequence[Output], found: Arrays, want: Arrays) -> np.ndarray:
-    """Return |found − want| (…, channel) of all readings over the largest |want| of each channel, flat.
+def full_scale_errors(outputs: Sequence[Output], readings: Arrays, expected: Arrays) -> np.ndarray:
+    """Return |readings − expected| of all channels over the largest |expected| of each channel, flat.
 
-    Of a sensor's further readings, such as what of a force is missed, the scale is at least that of its other channels of the
-    same unit: they are differences, and may be next to nothing. The error is infinite where all should be 0 and is not.
+    A sensor's secondary readings, such as `missed`, are differences that may be near 0. Their scale is at least that of the
+    sensor's other channels with the same unit. The error is infinite where all expected values are 0 and a reading is not.
 
     Raises:
-        ValueError: If anything is not finite.
+        ValueError: If an error is not finite.
     """
-    largest = {name: np.abs(value).reshape(-1, value.shape[-1]).max(axis=0) for name, value in want.items()}
+    largest = {name: np.abs(value).reshape(-1, value.shape[-1]).max(axis=0) for name, value in expected.items()}
     errors = []
     for output in outputs:
-        apart = np.abs(found[output.name] - want[output.name])
-        if not np.isfinite(apart).all():
-            raise ValueError(f"some of {output.name} is not finite, expected numbers")
-        alike = [o for o in outputs if o.sensor == output.sensor] if output.name != output.sensor else [output]
+        error = np.abs(readings[output.name] - expected[output.name])
+        if not np.isfinite(error).all():
+            raise ValueError(f"{output.name} is not finite, expected numbers")
         scale = largest[output.name].copy()
-        for other in alike:
-            for unit, size in zip(other.units, largest[other.name], strict=True):
-                is_alike = np.array(output.units) == unit
-                scale = np.where(is_alike & (other is not output), np.maximum(scale, size), scale)
-        scale = np.broadcast_to(scale, apart.shape)
-        errors.append(np.divide(apart, scale, out=np.where(apart > 0, np.inf, 0.0), where=scale > 0).reshape(-1))
+        if output.name != output.sensor:
+            for other in outputs:
+                if other.sensor == output.sensor and other is not output:
+                    for unit, size in zip(other.units, largest[other.name], strict=True):
+                        scale = np.where(np.array(output.units) == unit, np.maximum(scale, size), scale)
+        scale = np.broadcast_to(scale, error.shape)
+        errors.append(np.divide(error, scale, out=np.where(error > 0, np.inf, 0.0), where=scale > 0).reshape(-1))
     return np.concatenate(errors)
 
 
@@ -133,7 +133,7 @@ def full_scale_errors(outputs: Sequence[Output], found: Arrays, want: Arrays) ->
 
 
 def num_sets(num_bytes: float) -> int:
-    """Return how many sets of buffers of so many bytes are rotated."""
+    """Return the number of sets of buffers of a size to rotate."""
     return min(max(2, math.ceil(ROTATED / num_bytes)), MOST_SETS)
 
 
@@ -143,7 +143,7 @@ def synchronize(device: torch.device) -> None:
 
 
 def captured(call: Callable[[], Any], device: torch.device) -> Callable[[], None]:
-    """Return a call as a CUDA graph that keeps what it made; on a CPU as it is."""
+    """Return the replay of a call captured in a CUDA graph, which keeps the outputs; on a CPU the call."""
     if device.type != "cuda":
         return call
     stream = torch.cuda.Stream()
@@ -154,18 +154,18 @@ def captured(call: Callable[[], Any], device: torch.device) -> Callable[[], None
     torch.cuda.synchronize()
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph, stream=stream):
-        made = call()
+        outputs = call()
 
-    def replay(_kept: Any = (call, made)) -> None:  # the graph reads and writes their memory, so they must live as long
+    def replay(_memory: Any = (call, outputs)) -> None:  # the graph reads and writes their memory, so they must live as long
         graph.replay()
 
     return replay
 
 
 def median_ms(call: Callable[[], Any], repeats: int, device: torch.device, batch: int = 5) -> float:
-    """Return the median time of a call [ms], of batches of them; on a GPU between CUDA events."""
+    """Return the median time of a call [ms] over batches of calls; on a GPU between CUDA events."""
 
-    def taken() -> float:
+    def batch_ms() -> float:
         if device.type != "cuda":
             start = time.perf_counter()
             for _ in range(batch):
@@ -179,56 +179,56 @@ def median_ms(call: Callable[[], Any], repeats: int, device: torch.device, batch
         torch.cuda.synchronize()
         return events[0].elapsed_time(events[1])
 
-    return median_of(taken, repeats) / batch
+    return median_of(batch_ms, repeats) / batch
 
 
 def plain_ms(touch: TactileModule, states: list[SceneState], repeats: int, device: torch.device, batch: int = 20) -> float:
-    """Return the median time of a call of the module [ms], host and device, of batches that end when all is done."""
-    kept = deque(maxlen=8)  # kept, so that readings do not come to lie where the last ones were
+    """Return the median time of a call of the module [ms], host and device, over batches that end with the device idle."""
+    recent = deque(maxlen=8)  # readings stay alive, so that the next call cannot reuse their memory
 
-    def taken() -> float:
+    def batch_ms() -> float:
         synchronize(device)
         start = time.perf_counter()
         for i in range(batch):
-            kept.append(touch(states[i % len(states)]))
+            recent.append(touch(states[i % len(states)]))
         synchronize(device)
         return 1e3 * (time.perf_counter() - start)
 
-    return median_of(taken, repeats) / batch
+    return median_of(batch_ms, repeats) / batch
 
 
-def median_of(taken: Callable[[], float], repeats: int) -> float:
-    """Return the median of times [ms] after one that does not count; of fewer, but three, once they add up to `LONG`."""
-    taken()
+def median_of(measured: Callable[[], float], repeats: int) -> float:
+    """Return the median of measured times [ms] after a warm-up; once they exceed `LONG` in total, three are enough."""
+    measured()
     times: list[float] = []
     while len(times) < repeats and not (sum(times) > LONG and len(times) >= 3):
-        times.append(taken())
+        times.append(measured())
     return statistics.median(times)
 
 
 def replaying(bench: Bench, states: list[SceneState]) -> TactileModule:
-    """Return a module whose calls replay a graph, after a look at whether they read what plain calls do.
+    """Return a module whose calls replay a graph.
 
     Raises:
-        ValueError: If they do not, to the bit.
+        ValueError: If replayed readings differ from those of plain calls.
     """
     touch, plain = bench.module(graph=True), bench.module()
     for state in states[:CALLS]:
-        found, expected = touch(state), plain(state)
-        if off := [name for name in expected if not torch.equal(found[name], expected[name])]:
-            raise ValueError(f"replayed, {', '.join(off)} is not what a plain call reads")
+        readings, expected = touch(state), plain(state)
+        if names := [name for name in expected if not torch.equal(readings[name], expected[name])]:
+            raise ValueError(f"replayed readings of {', '.join(names)} differ from those of a plain call")
     return bench.module(graph=True)
 
 
 def copy_ms(num_bytes: int, repeats: int, device: torch.device) -> float:
-    """Return the median time [ms] of a copy that reads and writes so many bytes together, by the faster of two kernels."""
+    """Return the median time [ms] to read and write that many bytes in total, by the faster of two kernels."""
     pairs = [torch.rand(2, max(num_bytes // 8, 1), device=device).unbind(0) for _ in range(num_sets(num_bytes))]
-    ways = (lambda: [to.copy_(of) for of, to in pairs], lambda: [torch.neg(of, out=to) for of, to in pairs])
-    return min(median_ms(captured(way, device), repeats, device) for way in ways) / len(pairs)
+    copies = (lambda: [to.copy_(of) for of, to in pairs], lambda: [torch.neg(of, out=to) for of, to in pairs])
+    return min(median_ms(captured(copy, device), repeats, device) for copy in copies) / len(pairs)
 
 
 def rotating(bench: Bench, touch: TactileModule, states: list[SceneState], count: int) -> list[tuple[Tensors, Tensors]]:
-    """Return sets of inputs and state, each in memory of its own; the state is what the module remembers."""
+    """Return sets of inputs and module memory, each in separate buffers."""
     num_envs = next(value for value in vars(states[0]).values() if isinstance(value, Tensor)).shape[0]
     dt = DT if "dt" in bench.plan.inputs.fields else None
     sets = []
@@ -243,19 +243,19 @@ def rotating(bench: Bench, touch: TactileModule, states: list[SceneState], count
 
 
 def transient_bytes(touch: TactileModule, state: SceneState, device: torch.device) -> int | None:
-    """Return the most memory that a plain call has for a while, readings included; None on a CPU."""
+    """Return the peak memory of a plain call, readings included; None on a CPU."""
     if device.type != "cuda":
         return None
     torch.cuda.synchronize()
     torch.cuda.reset_peak_memory_stats()
-    before = torch.cuda.memory_allocated()
+    allocated = torch.cuda.memory_allocated()
     touch(state)
     torch.cuda.synchronize()
-    return torch.cuda.max_memory_allocated() - before
+    return torch.cuda.max_memory_allocated() - allocated
 
 
 def measure(bench: Bench, num_envs: int, error: np.ndarray, options: argparse.Namespace) -> Row:
-    """Time one case at one number of environments."""
+    """Time a case at one number of environments."""
     start = time.perf_counter()
     case, device = bench.case, bench.device
     size = bytes_of(TactileModule(bench.plan))
@@ -295,31 +295,31 @@ def measure(bench: Bench, num_envs: int, error: np.ndarray, options: argparse.Na
 
 
 def nums_of_envs(case: Case, options: argparse.Namespace) -> Sequence[int]:
-    """Return the numbers of environments at which to time a case: those asked for, those with a limit, or all of its own."""
+    """Return the numbers of environments at which to time a case: `--envs`, else the limited ones for `guard`, else all."""
     limited = [num_envs for name, num_envs in TARGETS if name == case.name]
     return options.envs or (limited if options.limited else case.envs)
 
 
 def rows_of(case: Case, options: argparse.Namespace) -> Iterator[Row]:
-    """Measure a case at each number of environments; one that fails is reported, and the others go on."""
+    """Measure a case at each number of environments; report a failure and go on."""
     plan, turn = load_plan(artefact(options.folder, case)), turns.Turn(options.turn)
     first = states_of(case, plan, nums_of_envs(case, options)[0], 1)[0]
     checked = states_of(case, plan, options.check_envs, CALLS, seed=100)
     turn.take()
-    bench, exact = Bench.of(case, plan, turn, options), TactileModule(plan, dtype=torch.float64).to(options.exact_on)
+    bench, exact = Bench.of(case, plan, turn, options), TactileModule(plan, dtype=torch.float64)
     touch, first = bench.module(), first.to(bench.device)
-    if options.exact_on == "cpu" and not options.eager:
+    if not options.eager:
         turn.give_back()
-    with torch.no_grad():  # code is made for many environments, then checked on few
-        want = readings_of(exact, [state.to(options.exact_on, torch.float64) for state in checked])
+    with torch.no_grad():  # code is compiled for many environments, then checked on few
+        expected = readings_of(exact, [state.to("cpu", torch.float64) for state in checked])
         touch(first)
-        found = readings_of(bench.module(), [state.to(bench.device) for state in checked])
-        error = full_scale_errors(exact.outputs, found, want)
+        readings = readings_of(bench.module(), [state.to(bench.device) for state in checked])
+        error = full_scale_errors(exact.outputs, readings, expected)
     for num_envs in nums_of_envs(case, options):
         try:
             with torch.no_grad():
                 row = measure(bench, num_envs, error, options)
-        except Exception:  # of one number: the others are wanted all the same
+        except Exception:  # the other numbers of environments are still worth measuring
             print(f"{case.name} × {num_envs}: FAILED\n{traceback.format_exc()}", flush=True)
         else:
             yield row
@@ -329,7 +329,7 @@ def rows_of(case: Case, options: argparse.Namespace) -> Iterator[Row]:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Measure cases and write their rows down; stop in time and say what is left."""
+    """Measure cases and write their rows; report those for which no time is left."""
     if options.child:
         for row in rows_of(CASES[options.rows[0]], options):
             print(row.line(), flush=True)
@@ -339,91 +339,88 @@ def run(options: argparse.Namespace) -> None:
     where = torch.cuda.get_device_name() if options.device != "cpu" else "CPU"
     versions = {"device": where, "torch": torch.__version__, "repeats": options.repeats}
     print(f"torch {torch.__version__}, {where}, float32, medians of up to {options.repeats}; times [ms]\n{HEAD}", flush=True)
-    for (name,), said, out in turns.children(options, ["--rows"], [(name,) for name in options.rows]):
-        if said is None:
+    for (name,), output, out in turns.children(options, ["--rows"], [(name,) for name in options.rows]):
+        if output is None:
             left.append(name)
             continue
-        print(said, end="", flush=True)
+        print(output, end="", flush=True)
         for row in load_rows([out]) if out.exists() else []:
             write(options.out, row, versions)
     print(f"{time.perf_counter() - start:.0f} s" + (f"; not measured: {' '.join(left)}" if left else ""))
 
 
 def guard(options: argparse.Namespace) -> None:
-    """Time the rows that have a limit; exit 1 if one's ratio to the copy is worse than the kept one by more than a tenth."""
+    """Time the rows that have a limit; exit 1 if a ratio to the copy exceeds the recorded one by more than a tenth."""
     options.limited = True
     if options.child:
         run(options)
     options.out.unlink(missing_ok=True)
     run(options)
     card = json.loads(options.out.read_text())["device"]
-    kept = json.loads(options.kept.read_text()) if options.kept.exists() else {}
+    records = json.loads(options.kept.read_text()) if options.kept.exists() else {}
     ratios = {f"{row.case} × {row.num_envs:,}": round(row.graph / row.copy, 3) for row in load_rows([options.out])}
     if options.keep:
-        options.kept.write_text(json.dumps({**kept, card: ratios}, indent=1, ensure_ascii=False) + "\n")
-    lines, is_met = compared(ratios, kept.get(card, {}))
+        options.kept.write_text(json.dumps({**records, card: ratios}, indent=1, ensure_ascii=False) + "\n")
+    lines, is_met = compared(ratios, records.get(card, {}))
     print(f"{card}\n" + "\n".join(lines))
     raise SystemExit(0 if is_met or options.keep else 1)
 
 
-def compared(ratios: Mapping[str, float], kept: Mapping[str, float]) -> tuple[list[str], bool]:
-    """Compare ratios to the copy with kept ones, by row.
+def compared(ratios: Mapping[str, float], recorded: Mapping[str, float]) -> tuple[list[str], bool]:
+    """Compare ratios to the copy with recorded ones, by row.
 
     Returns:
-        A line per row, and whether every kept row was timed and none is slower by more than `SLOWER`.
+        A line per row, and whether every recorded row was timed and none is slower by more than `SLOWER`.
     """
-    lines, is_met = [], bool(kept)
-    for name in {**kept, **ratios}:
-        ratio, old = ratios.get(name), kept.get(name)
+    lines, is_met = [], bool(recorded)
+    for name in {**recorded, **ratios}:
+        ratio, old = ratios.get(name), recorded.get(name)
         is_slower = old is not None and (ratio is None or ratio > (1 + SLOWER) * old)
         is_met &= not is_slower
-        change = "not timed" if ratio is None else "nothing kept" if old is None else f"{ratio / old - 1:+.0%}"
+        change = "not timed" if ratio is None else "not recorded" if old is None else f"{ratio / old - 1:+.0%}"
         lines.append(f"{name:<34}{ratio or math.nan:8.3f}{old or math.nan:8.3f}  {change}{'  SLOWER' if is_slower else ''}")
     return lines, is_met
 
 
 def write(path: Path, row: Row, versions: dict[str, Any]) -> None:
-    """Add a row to a JSON file, in the place of that of the same measurement."""
-    kept = [other for other in load_rows([path]) if other.key != row.key] if path.exists() else []
+    """Add a row to a JSON file; it replaces an earlier row of the same measurement."""
+    rows = [other for other in load_rows([path]) if other.key != row.key] if path.exists() else []
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({**versions, "rows": [asdict(other) for other in (*kept, row)]}, indent=1))
+    path.write_text(json.dumps({**versions, "rows": [asdict(other) for other in (*rows, row)]}, indent=1))
 
 
 def parsed(arguments: list[str] | None = None) -> argparse.Namespace:
-    """Return the command line, and in `arguments` what begins it again."""
+    """Return the parsed command line, and in `arguments` the command that repeats it."""
     arguments = sys.argv[1:] if arguments is None else arguments
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
-    making = commands.add_parser("artefacts", help="compile all documents")
-    making.add_argument("folder", type=Path)
-    making.add_argument("--rows", nargs="+", choices=CASES, default=list(CASES))
-    making.set_defaults(call=lambda options: make_artefacts(options.folder, [CASES[name] for name in options.rows]))
+    compiling = commands.add_parser("artefacts", help="compile all documents")
+    compiling.add_argument("folder", type=Path)
+    compiling.add_argument("--rows", nargs="+", choices=CASES, default=list(CASES))
+    compiling.set_defaults(call=lambda options: make_artefacts(options.folder, [CASES[name] for name in options.rows]))
     for name, call in (("run", run), ("guard", guard)):
         running = commands.add_parser(name, help=str(call.__doc__).partition(";")[0])
         running.add_argument("folder", type=Path, help="artefacts")
         running.add_argument("--rows", nargs="+", choices=CASES, default=list(CASES))
-        running.add_argument("--envs", nargs="+", type=int, help="these instead of each case's numbers of environments")
+        running.add_argument("--envs", nargs="+", type=int, help="numbers of environments, instead of each case's")
         running.add_argument("--device", default="cuda")
         running.add_argument("--eager", action="store_true", help="leave the modules uncompiled")
         running.add_argument("--repeats", type=int, default=30)
-        running.add_argument("--sets", type=int, help="sets of buffers, instead of what exceeds the L2")
+        running.add_argument("--sets", type=int, help="sets of buffers, instead of enough to exceed the L2")
         running.add_argument("--check-envs", type=int, default=64, help="environments whose readings are compared")
-        running.add_argument(
-            "--exact-on", default="cpu", help="where the float64 module runs; on the CPU while others have the turn"
-        )
         turns.add_options(running)
         running.set_defaults(call=call, limited=False)
         if name == "run":
-            running.add_argument("--out", type=Path, required=True, help="JSON file; other rows of an earlier run are kept")
+            running.add_argument("--out", type=Path, required=True, help="JSON file, in which rows of earlier runs stay")
         else:
             running.add_argument("--out", type=Path, default=Path("out/gpu_guard.json"), help="JSON file of the rows")
-            running.add_argument("--kept", type=Path, default=KEPT, help="JSON file of kept ratios, by card and row")
-            running.add_argument("--keep", action="store_true", help="keep the ratios of this run")
+            running.add_argument("--kept", type=Path, default=KEPT, help="JSON file of recorded ratios, by card and row")
+            running.add_argument("--keep", action="store_true", help="record the ratios of this run")
             running.set_defaults(rows=list(dict.fromkeys(case for case, _ in TARGETS)))
     gpu_plots.add_commands(commands)
     return parser.parse_args(arguments, argparse.Namespace(arguments=[__file__, *arguments]))
 
 
 if __name__ == "__main__":
-    chosen = parsed()
-    chosen.call(chosen)
+    command = parsed()
+    command.call(command)

@@ -1,4 +1,4 @@
-"""What `gpu.py` measured: its rows, what is asked of them, the tables and the plots."""
+"""The rows that `gpu.py` measures, their limits, the tables and the plots."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from gpu_scenes import CASES, KNOBS, MAIN, artefact, bytes_of
 from tgdsl.module.artifact import load
 
 CLOSE = 1e-5
-"""Largest error that 99.9 % of all numbers may have, of full scale."""
+"""Limit of the 99.9 % quantile of the errors, relative to full scale."""
 FEWER_TIMES = 6.0
-"""How many times less than the rival's a time is to be."""
+"""Required ratio of the rival's time to a row's."""
 CLEAN_BYTES, NOISY_BYTES, ANCHOR_BYTES = 40.0, 120.0, 16.0
-"""Most bytes per taxel and environment without and with noise, and per point that an elastomer tracks."""
+"""Limits of bytes per taxel and environment without and with noise, and per point that an elastomer tracks."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One case at one number of environments: sizes, errors of full scale, median times [ms], bytes.
+    """A case at one number of environments: sizes, errors relative to full scale, median times [ms], bytes.
 
     Attributes:
-        in_contact: Share of taxels that read something.
-        error: What 99.9 % of all numbers stay within; the rest may be on the other side of a jump, such as a rounding step.
-        error_largest: The largest one.
+        in_contact: Share of taxels with a nonzero reading.
+        error: 99.9 % quantile of the errors; rounding may put the rest across a jump, such as a quantization step.
+        error_largest: Largest error.
         graph: A call in a replayed CUDA graph.
         plain: A call from Python.
         replayed: A call from Python of a module compiled with `graph=True`.
-        copy: A copy of as many bytes as a call must move.
+        copy: A copy of `moved` bytes.
         sets: Sets of buffers in the graph.
-        moved: What a call must move [bytes].
-        per_taxel: Readings and state per taxel and environment, less ring and anchors [bytes].
-        ring_per_taxel: The delay's ring per taxel and environment [bytes].
-        anchors_per_taxel: What an elastomer remembers of points or taxels that can hold on, per taxel and environment [bytes].
-        per_anchor: What is remembered per point or taxel that can hold on, and environment [bytes].
-        transient: Most memory that a plain call has for a while [bytes]; None where that was not measured.
-        seconds: How long it took to measure this.
+        moved: Bytes that a call must move.
+        per_taxel: Bytes of readings and state per taxel and environment, without ring and anchors.
+        ring_per_taxel: Bytes of the delay's ring per taxel and environment.
+        anchors_per_taxel: Bytes of an elastomer's anchors per taxel and environment.
+        per_anchor: Bytes per anchor and environment.
+        transient: Peak memory of a plain call [bytes]; None where it was not measured.
+        seconds: Time of the whole measurement.
     """
 
     case: str
@@ -79,13 +79,13 @@ class Row:
     def line(self) -> str:
         """Return the row as text."""
         target = TARGETS.get(self.key, Target())
-        asked = f"{shown(target.limit)}{shown(target.rival)}{judged(self, None).partition(':')[0]:>6}"
-        held = "" if self.transient is None else f"{self.transient / self.num_envs / self.num_taxels:9.1f}"
+        limits = f"{column(target.limit)}{column(target.rival)}{judged(self, None).partition(':')[0]:>6}"
+        peak = "" if self.transient is None else f"{self.transient / self.num_envs / self.num_taxels:9.1f}"
         return (
             f"{self.case:<30}{self.num_envs:>6} ×{self.num_taxels:>6}{self.in_contact:6.0%}{self.error:9.1e}"
             f"{self.error_largest:9.1e}{self.graph:9.4f}{self.plain:9.4f}{self.replayed:9.4f}{self.copy:9.4f}"
-            f"{self.graph / self.copy:9.3g}{asked}"
-            f"{1e-6 * self.moved:9.1f}{self.per_taxel:8.1f}{self.ring_per_taxel:8.1f}{held}{self.seconds:7.1f} s"
+            f"{self.graph / self.copy:9.3g}{limits}"
+            f"{1e-6 * self.moved:9.1f}{self.per_taxel:8.1f}{self.ring_per_taxel:8.1f}{peak}{self.seconds:7.1f} s"
         )
 
 
@@ -95,18 +95,18 @@ HEAD = (
 )
 
 
-# What is asked --------------------------------------------------------------------------------------------------------------
+# Limits ---------------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Target:
-    """What is asked of a row.
+    """The limits of a row.
 
     Attributes:
-        limit: Most time of a call in a graph [ms].
-        plain: Most time of a call from Python [ms].
-        rival: What genesis-world 1.4.5 takes for one update of such a sensor on an H200 [ms].
-        times_clean: How many times the row "kinematic" of as many environments it may take.
+        limit: Time of a call in a graph [ms].
+        plain: Time of a call from Python [ms].
+        rival: Time of an update of such a sensor in genesis-world 1.4.5 on an H200 [ms].
+        times_clean: Time relative to the row "kinematic" of as many environments.
     """
 
     limit: float | None = None
@@ -129,19 +129,19 @@ TARGETS: dict[tuple[str, int], Target] = {
     ("elastomer-500-points", MAIN): Target(0.40, rival=2.58),
     ("elastomer-1000-points", MAIN): Target(0.7),
 }
-"""Limits, in the order of the table; one without numbers is only to run."""
+"""Limits, in the order of the table; a row without numbers must only run."""
 
 
 def unmet(row: Row, clean: Row | None) -> list[str]:
-    """Return what of all that is asked of a row it does not reach, in words.
+    """Return the limits that a row exceeds, in words.
 
     Args:
         row: The row.
-        clean: The row that `times_clean` speaks of; None where it is not known, which counts as not reached.
+        clean: The row to which `times_clean` refers; None, where it was not measured, counts as exceeded.
     """
     target = TARGETS.get(row.key, Target())
     most_bytes = CLEAN_BYTES if row.noise == "clean" else NOISY_BYTES
-    found = {
+    misses = {
         f"graph {row.graph:.5g} ms > {target.limit} ms": target.limit is not None and row.graph > target.limit,
         f"from Python {row.replayed:.4g} ms > {target.plain} ms": target.plain is not None and row.replayed > target.plain,
         f"{row.per_taxel:.1f} B per taxel > {most_bytes:g} B": row.per_taxel > most_bytes,
@@ -150,16 +150,16 @@ def unmet(row: Row, clean: Row | None) -> list[str]:
     }
     if target.rival is not None:
         less = target.rival / row.graph
-        found[f"{less:.1f} times less than the rival's, not {FEWER_TIMES:g}"] = less < FEWER_TIMES
+        misses[f"{less:.1f} times less than the rival's, not {FEWER_TIMES:g}"] = less < FEWER_TIMES
     if target.times_clean is not None:
         ratio = None if clean is None else row.graph / clean.graph
-        said = "clean not measured" if ratio is None else f"{ratio:.2f} × clean > {target.times_clean:g} ×"
-        found[said] = ratio is None or ratio > target.times_clean
-    return [said for said, is_missed in found.items() if is_missed]
+        reason = "clean not measured" if ratio is None else f"{ratio:.2f} × clean > {target.times_clean:g} ×"
+        misses[reason] = ratio is None or ratio > target.times_clean
+    return [reason for reason, is_missed in misses.items() if is_missed]
 
 
 def judged(row: Row, clean: Row | None) -> str:
-    """Return "yes", or "no" and why; a dash where no time is asked for, or that which it is compared with is not known."""
+    """Return "yes", or "no" and the reasons; a dash where there is no limit, or no clean row to compare with."""
     target = TARGETS.get(row.key)
     if target is not None and target.times_clean is not None and clean is None:
         return "–"
@@ -170,23 +170,21 @@ def judged(row: Row, clean: Row | None) -> str:
 
 
 def load_rows(paths: Iterable[Path]) -> list[Row]:
-    """Return the rows of JSON files; of two of the same measurement the later one."""
-    rows: dict[tuple[str, int], Row] = {}
-    for path in paths:
-        rows |= {row.key: row for row in (Row(**found) for found in json.loads(path.read_text())["rows"])}
-    return list(rows.values())
+    """Return the rows of JSON files; a later row replaces an earlier one of the same measurement."""
+    rows = (Row(**fields) for path in paths for fields in json.loads(path.read_text())["rows"])
+    return list({row.key: row for row in rows}.values())
 
 
 # Tables ---------------------------------------------------------------------------------------------------------------------
 
 
-def shown(value: float | None) -> str:
-    """Return a number in a column of nine."""
+def column(value: float | None) -> str:
+    """Return a number as text, nine characters wide."""
     return f"{'–':>9}" if value is None else f"{value:9.4g}"
 
 
 def limits_table(rows: list[Row]) -> list[str]:
-    """Return the markdown table of the rows that have limits."""
+    """Return the rows that have limits, as Markdown."""
     by_key = {row.key: row for row in rows}
     times = "graph, ms | limit, ms | met | plain, ms | replayed, ms"
     lines = [
@@ -210,7 +208,7 @@ def limits_table(rows: list[Row]) -> list[str]:
 
 
 def others_table(rows: list[Row]) -> list[str]:
-    """Return the markdown table of the other rows; what is asked of them all is the error and the bytes."""
+    """Return the other rows, which have limits of error and bytes alone, as Markdown."""
     heads = "graph, ms | plain, ms | replayed, ms | MB moved | ratio to copy | bytes held | at once | not met"
     lines = [f"| case | envs × taxels | error (largest) | {heads} |", f"|{'---|' * 11}"]
     for row in (row for row in rows if row.key not in TARGETS):
@@ -224,16 +222,16 @@ def others_table(rows: list[Row]) -> list[str]:
 
 
 def table(options: argparse.Namespace) -> None:
-    """Print what was measured as markdown."""
+    """Print the results as Markdown."""
     for path in options.results:
-        kept = json.loads(path.read_text())
-        print(f"{kept['device']}, torch {kept['torch']}, float32, medians of up to {kept['repeats']}")
+        results = json.loads(path.read_text())
+        print(f"{results['device']}, torch {results['torch']}, float32, medians of up to {results['repeats']}")
     rows = load_rows(options.results)
     print("", *limits_table(rows), "", *others_table(rows), sep="\n")
 
 
 def bytes_table(options: argparse.Namespace) -> None:
-    """Print per taxel and environment what every case gives out and remembers, as markdown."""
+    """Print the bytes of readings and state of every case, per taxel and environment, as Markdown."""
     print(f"| case | readings | state | in all | delay's ring | per tracked point | moved per call |\n|{'---|' * 7}")
     for case in CASES.values():
         path = artefact(options.folder, case)
@@ -249,7 +247,7 @@ def bytes_table(options: argparse.Namespace) -> None:
 # Plots ----------------------------------------------------------------------------------------------------------------------
 
 COLOURS = ("#1b7f4d", "#3b6fb6", "#b5542c", "#e0a03a", "#7a4fa3", "#c2315b", "#2b2f36", "#5aa7a7")
-RIVALS = {  # of the same GPU and scene: environments × taxels, ms
+RIVALS = {  # on the same GPU and scene: environments, taxels, ms
     "contact_depth": (16_384, 100, 0.16),
     "kinematic_taxel": (16_384, 100, 0.41),
     "proximity": (16_384, 100, 0.48),
@@ -257,68 +255,67 @@ RIVALS = {  # of the same GPU and scene: environments × taxels, ms
 }
 WIDE_RIVAL = (1_024, 10_000, 2.17)
 RIVAL_BYTES = 400.0
-"""What the rival holds, about, per taxel and environment."""
-Chosen = dict[str, list[Row]]
+"""Approximate bytes that the rival holds per taxel and environment."""
+Curves = dict[str, list[Row]]
 
 
-def _by_envs(rows: list[Row]) -> Chosen:
+def _by_envs(rows: list[Row]) -> Curves:
     names = [name for name, case in CASES.items() if len(case.envs) > 2 and case.num_taxels == 100]
     return {name: sorted((row for row in rows if row.case == name), key=lambda row: row.num_envs) for name in names}
 
 
-def _by_taxels(rows: list[Row]) -> Chosen:
-    wanted = [r for r in rows if r.kind == "kinematic_taxel" and r.num_envs == 1_024 and r.num_objects == 1]
+def _by_taxels(rows: list[Row]) -> Curves:
+    rows = [r for r in rows if r.kind == "kinematic_taxel" and r.num_envs == 1_024 and r.num_objects == 1]
     return {
-        f"kinematic, {noise}": sorted((r for r in wanted if r.noise == noise), key=lambda row: row.num_taxels)
+        f"kinematic, {noise}": sorted((r for r in rows if r.noise == noise), key=lambda row: row.num_taxels)
         for noise in ("clean", "noisy")
     }
 
 
-def _by_objects(rows: list[Row]) -> Chosen:
-    wanted = [r for r in rows if r.kind == "kinematic_taxel" and r.noise == "clean" and r.num_envs == MAIN]
-    wanted = [r for r in wanted if r.num_taxels == 100]
-    return {"kinematic, clean": sorted(wanted, key=lambda row: row.num_objects)}
+def _by_objects(rows: list[Row]) -> Curves:
+    rows = [r for r in rows if r.kind == "kinematic_taxel" and r.noise == "clean" and r.num_envs == MAIN]
+    return {"kinematic, clean": sorted((r for r in rows if r.num_taxels == 100), key=lambda row: row.num_objects)}
 
 
-def _by_points(rows: list[Row]) -> Chosen:
-    wanted = sorted((r for r in rows if r.points and r.noise == "clean" and r.num_envs == 1_024), key=lambda row: row.points)
-    return {kind: [row for row in wanted if row.kind == kind] for kind in ("elastomer", "proximity")}
+def _by_points(rows: list[Row]) -> Curves:
+    rows = sorted((r for r in rows if r.points and r.noise == "clean" and r.num_envs == 1_024), key=lambda row: row.points)
+    return {kind: [row for row in rows if row.kind == kind] for kind in ("elastomer", "proximity")}
 
 
 def throughput(rows: list[Row]) -> Any:
     """Return the figure of taxels read per second, by environments, taxels, objects and points; crosses are the rival's."""
     from matplotlib.figure import Figure
 
-    panels: list[tuple[str, Chosen, Callable[[Row], int]]] = [
+    panels: list[tuple[str, Curves, Callable[[Row], int]]] = [
         ("environments", _by_envs(rows), lambda row: row.num_envs),
         ("taxels, 1,024 environments", _by_taxels(rows), lambda row: row.num_taxels),
         ("felt objects, 16,384 environments", _by_objects(rows), lambda row: row.num_objects),
         ("points of each object, 1,024 environments", _by_points(rows), lambda row: row.points),
     ]
     figure = Figure(figsize=(12, 9), layout="constrained")
-    for axes, (label, chosen, of) in zip(figure.subplots(2, 2).flat, panels, strict=True):
-        for (name, own), colour in zip(chosen.items(), COLOURS, strict=False):
-            axes.plot([of(r) for r in own], [r.rate for r in own], "o-", color=colour, markersize=4, label=name)
-            rival = RIVALS.get(own[0].kind) if own and label == "environments" and own[0].noise == "clean" else None
+    for axes, (label, curves, size_of) in zip(figure.subplots(2, 2).flat, panels, strict=True):
+        for (name, curve), colour in zip(curves.items(), COLOURS, strict=False):
+            axes.plot([size_of(r) for r in curve], [r.rate for r in curve], "o-", color=colour, markersize=4, label=name)
+            rival = RIVALS.get(curve[0].kind) if curve and label == "environments" and curve[0].noise == "clean" else None
             if rival is not None:
                 axes.plot(rival[0], 1e3 * rival[0] * rival[1] / rival[2], "x", color=colour, markersize=8)
-        if label.startswith("taxels") and any(chosen.values()):
+        if label.startswith("taxels") and any(curves.values()):
             axes.plot(WIDE_RIVAL[1], 1e3 * WIDE_RIVAL[0] * WIDE_RIVAL[1] / WIDE_RIVAL[2], "kx", markersize=8, label="rival")
-        scale = "log" if any(chosen.values()) else "linear"
+        scale = "log" if any(curves.values()) else "linear"
         axes.set(xscale=scale, yscale=scale, xlabel=label, ylabel="taxels read per second")
         axes.grid(alpha=0.25, which="both")
-        if any(chosen.values()):
-            at = sorted({of(row) for own in chosen.values() for row in own})
-            axes.set_xticks(at, [f"{value:,}" for value in at])
+        if any(curves.values()):
+            sizes = sorted({size_of(row) for curve in curves.values() for row in curve})
+            axes.set_xticks(sizes, [f"{size:,}" for size in sizes])
             axes.tick_params(axis="x", which="minor", bottom=False, labelbottom=False)
-            axes.legend(frameon=False, fontsize=8.5, **({"loc": "lower right", "ncols": 3} if len(chosen) > 3 else {}))
-        if len(chosen) > 3:
+            axes.legend(frameon=False, fontsize=8.5, **({"loc": "lower right", "ncols": 3} if len(curves) > 3 else {}))
+        if len(curves) > 3:
             axes.set_ylim(bottom=axes.get_ylim()[0] / 3)  # room for the names
     return figure
 
 
 def memory(rows: list[Row]) -> Any:
-    """Return the figure of bytes per taxel and environment, and what noise costs in time."""
+    """Return the figure of bytes per taxel and environment, and of the relative time of noise."""
     from matplotlib.figure import Figure
 
     main = {row.case: row for row in rows if row.num_envs == MAIN and row.num_taxels == 100}
@@ -350,7 +347,7 @@ def memory(rows: list[Row]) -> Any:
 
 
 def plot(options: argparse.Namespace) -> None:
-    """Draw what was measured."""
+    """Draw the results."""
     rows = load_rows(options.results)
     options.out.mkdir(parents=True, exist_ok=True)
     for name, draw in {"gpu_throughput": throughput, "gpu_memory": memory}.items():
@@ -366,6 +363,6 @@ def add_commands(commands: Any) -> None:
         command.set_defaults(call=call)
         if name == "plot":
             command.add_argument("--out", type=Path, default=Path("docs/images"), help="folder for the images")
-    counting = commands.add_parser("bytes", help=str(bytes_table.__doc__))
-    counting.add_argument("folder", type=Path)
-    counting.set_defaults(call=bytes_table)
+    command = commands.add_parser("bytes", help=str(bytes_table.__doc__))
+    command.add_argument("folder", type=Path)
+    command.set_defaults(call=bytes_table)

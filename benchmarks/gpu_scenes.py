@@ -1,7 +1,4 @@
-"""What `gpu.py` times: flat pads of taxels under cubes, their artefacts and states, and the bytes that each call must move.
-
-Shapes: `env` environments.
-"""
+"""Scenes for `gpu.py`: flat pads of taxels under cubes, their artefacts and states, and the bytes that each call must move."""
 
 from __future__ import annotations
 
@@ -21,21 +18,21 @@ from tgdsl.module.state import SceneState
 from tgdsl.sensors import KINDS as TGDSL_KINDS
 
 PITCH = 0.07
-"""Distance between the middles of two pads [m]."""
+"""Distance between the centres of two pads [m]."""
 TOP = 0.005
-"""Height of a pad's surface over its body's origin [m]."""
+"""Height of a pad's surface above its body's origin [m]."""
 HALF = 0.02
 """Half the edge of a cube [m]."""
 DT = 0.01
 """Time between two calls [s]."""
 ANCHORS = ("anchor_x", "anchor_y", "anchor_z", "held", "object")
-"""What an elastomer remembers of each point or taxel, by name."""
+"""State of an elastomer for each anchored point or taxel."""
 GRIDS = {10: (2, 5), 100: (10, 10), 1_000: (25, 40), 10_000: (100, 100)}
 """Rows and columns of a pad, by its number of taxels."""
 MAIN = 16_384
 """Number of environments of most limits."""
 SWEPT = (MAIN, 1_024, 4_096, 65_536)
-"""Numbers of environments of a sweep; code is compiled for the first one."""
+"""Numbers of environments of a sweep; code is compiled for the first."""
 KINDS: dict[str, dict[str, Any]] = {
     "contact_depth": {},
     "contact": {"threshold": 5e-4, "release_threshold": 2e-4},
@@ -46,7 +43,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "elastomer": {"anchors": "points", "points": 500},
     "surface_distance": {},
 }
-"""Every kind of sensor, with what it is given."""
+"""Fields of a sensor of each kind."""
 EVERY_KNOB: dict[str, Any] = {
     "read_delay": 0.01,
     "jitter": 0.02,
@@ -61,9 +58,9 @@ EVERY_KNOB: dict[str, Any] = {
     "crosstalk": {"strength": 0.3, "sigma": 3e-3},
     "radius_noise": 3e-4,
 }
-"""The full noise model; each kind gets the knobs that it has."""
+"""The full noise model; each kind takes the knobs that it supports."""
 FINE = {"contact_depth": 1e-4, "contact": 1e-4, "surface_distance": 1e-4}
-"""Steps of the kinds whose readings are depths and distances [m]: in the others `EVERY_KNOB`'s."""
+"""Quantization of kinds that read depths and distances [m]; the others have that of `EVERY_KNOB`."""
 KNOBS: dict[str, dict[str, Any]] = {
     "radius-noise": {"radius_noise": 3e-4},
     "gain": {"gain": [0.85, 1.15]},
@@ -77,7 +74,7 @@ KNOBS: dict[str, dict[str, Any]] = {
     "quantization": {"quantization": 1e-2},
     "dead-taxels": {"dead_probability": 0.05, "dead_range": [0.0, 1.0]},
 }
-"""Terms of the noise, each alone; calls are `DT` apart."""
+"""Noise terms timed separately; calls are `DT` apart."""
 
 
 @dataclass(frozen=True)
@@ -85,16 +82,16 @@ class Case:
     """A document to time: sensors of one kind on flat pads, under a tower of cubes.
 
     Attributes:
-        name: Its name.
-        kind: Kind of its sensors.
-        envs: Numbers of environments; code is compiled for the first one and serves the others.
+        name: Name of the row.
+        kind: Kind of the sensors.
+        envs: Numbers of environments; code is compiled for the first and serves the others.
         num_taxels: Taxels of each pad.
-        num_pads: Pads in a row, each with a sensor of its own; one object covers them all.
-        num_objects: Cubes one on the other, all felt.
-        points: Points that are sampled of each object; 0 for none.
-        contacts: Contacts of each pad and object, in the first of eight slots: a cube that rests has four.
+        num_pads: Pads in a row, each with a separate sensor; each object covers all pads.
+        num_objects: Stacked cubes, all felt by every sensor.
+        points: Points sampled on each object; 0 for none.
+        contacts: Contacts of each pad and object, in the first of eight slots; a resting cube has four.
         noise: "clean", "noisy" (the profile), "full" (`EVERY_KNOB`) or one of `KNOBS`.
-        fields: What the sensor is given beside `KINDS`.
+        fields: Fields of the sensor that override `KINDS`.
     """
 
     name: str
@@ -115,7 +112,7 @@ class Case:
 
     @property
     def objects(self) -> list[str]:
-        """Names of the bodies that are felt."""
+        """Names of the bodies that the sensors feel."""
         return [f"cube{i}" for i in range(self.num_objects)]
 
 
@@ -160,7 +157,7 @@ _SWEEPS = (
     *(_kinematic(knob, noise=knob) for knob in KNOBS),
 )
 CASES = {case.name: case for case in (*_LIMITED, *_SWEEPS)}
-"""All cases: first those that have limits, then the sweeps."""
+"""All cases: those with limits, then the sweeps."""
 
 
 # Documents ------------------------------------------------------------------------------------------------------------------
@@ -183,7 +180,7 @@ def scene(case: Case) -> str:
 
 
 def document(case: Case, folder: Path) -> dict[str, Any]:
-    """Return the document of a case, whose scene is written to a folder."""
+    """Return the document of a case; write its scene to a folder."""
     model = folder / "scene.xml"
     model.write_text(scene(case))
     rows, columns = GRIDS[case.num_taxels]
@@ -201,7 +198,7 @@ def document(case: Case, folder: Path) -> dict[str, Any]:
 
 
 def noise_of(case: Case) -> dict[str, Any]:
-    """Return the noise of a case as its sensors have it; nothing if they are clean."""
+    """Return the `noise` field of a case's sensors; nothing if they are clean."""
     if case.noise == "clean":
         return {}
     if case.noise == "noisy":
@@ -214,7 +211,7 @@ def noise_of(case: Case) -> dict[str, Any]:
 
 
 def artefact(folder: Path, case: Case) -> Path:
-    """Return the file of a case."""
+    """Return the path of a case's artefact."""
     return folder / f"{case.name}.safetensors"
 
 
@@ -233,9 +230,9 @@ def make_artefacts(folder: Path, cases: list[Case]) -> None:
 
 
 def state_of(touch: TactileModule, num_envs: int, seed: int, contacts: int = 4) -> SceneState:
-    """Return random float32 states on the module's device: the lowest cube rests on the pads or in them, ± 0.3 mm and 1°.
+    """Return random float32 states (env) on the module's device: the lowest cube rests on the pads, ± 0.3 mm and 1°.
 
-    Of each pair `contacts` slots hold a contact.
+    Each pair has `contacts` contacts.
     """
     state = touch.example_state(num_envs, seed=seed, dtype=torch.float32, spread=0.0003)
     assert state.body_pos is not None and state.body_quat is not None
@@ -272,17 +269,17 @@ def _on_pads(touch: TactileModule, pos: Tensor, seed: int) -> Tensor:
 
 @dataclass(frozen=True)
 class Bytes:
-    """What a call moves and a module holds, per environment [bytes]; constants, which all environments share, are left out.
+    """Bytes per environment that a call moves and a module holds, without the constants that environments share.
 
     Attributes:
-        inputs: The fields of the scene's state.
-        outputs: The readings.
-        state: What is remembered, without what follows; the clock's counts of each environment are part of it.
-        anchors: What an elastomer remembers of points or taxels that hold on.
-        ring_entry: One call of the rings of delays.
-        ring_calls: How many calls they hold.
-        num_taxels: Taxels (of `link_contact`, bodies) of all sensors [1].
-        num_anchors: Points or taxels that can hold on [1].
+        inputs: Fields of the scene's state.
+        outputs: Readings.
+        state: Module memory without anchors and rings; it includes the clock's counts of each environment.
+        anchors: Anchors of elastomers.
+        ring_entry: One call in the rings of delays.
+        ring_calls: Number of calls that the rings hold [1].
+        num_taxels: Taxels (bodies for `link_contact`) of all sensors [1].
+        num_anchors: Points or taxels that can be anchored [1].
     """
 
     inputs: int
@@ -296,58 +293,58 @@ class Bytes:
 
     @property
     def moved(self) -> int:
-        """What a call must move: inputs read, readings written, state both; of a ring two entries read, one written."""
+        """Bytes that a call must move: read inputs, write readings, read and write state; read two ring entries, write one."""
         return self.inputs + self.outputs + 2 * (self.state + self.anchors) + 3 * self.ring_entry
 
     @property
     def held(self) -> int:
-        """What has memory of its own: inputs, readings, and all that is remembered."""
+        """Bytes of inputs, readings and the whole memory."""
         return self.inputs + self.outputs + self.state + self.anchors + self.ring_calls * self.ring_entry
 
     @property
     def per_taxel(self) -> float:
-        """Readings and state per taxel, less the delay's ring and the elastomer's anchors."""
+        """Readings and state per taxel, without rings and anchors."""
         return (self.outputs + self.state) / self.num_taxels
 
     @property
     def ring_per_taxel(self) -> float:
-        """The delay's ring per taxel."""
+        """The ring of delays per taxel."""
         return self.ring_calls * self.ring_entry / self.num_taxels
 
     @property
     def per_anchor(self) -> float:
-        """What is remembered of each point or taxel that can hold on; 0 if there are none."""
+        """Bytes per anchor; 0 without anchors."""
         return self.anchors / self.num_anchors if self.num_anchors else 0.0
 
 
 def bytes_of(touch: TactileModule) -> Bytes:
-    """Count the bytes of a float32 module whose calls are `DT` apart, from the tensors that it is given and allocates."""
+    """Count the bytes of a float32 module whose calls are `DT` apart, from the tensors that it reads and allocates."""
     if any(sensor.windows for sensor in touch.plan.sensors):
-        raise ValueError("stacked readings are not counted here, expected sensors without `history`")
+        raise ValueError("stacked readings are not supported here, expected sensors without `history`")
     state = touch.example_state(2, dtype=torch.float32)
-    given = [value for name in touch.inputs.fields if isinstance(value := getattr(state, name), Tensor)]
+    inputs = [value for name in touch.inputs.fields if isinstance(value := getattr(state, name), Tensor)]
     fresh = TactileModule(touch.plan)
     memory = fresh.memory.tensors(2, DT if "dt" in touch.inputs.fields else None, torch.float32, torch.device("cpu"))
-    found = {"state": 0, "anchors": 0, "ring": 0}
+    sizes = {"state": 0, "anchors": 0, "ring": 0}
     ring_calls = num_anchors = 0
     for path, value in memory.items():
         sensor, name = path.rsplit(":", 1) if ":" in path else ("", path)
         size = value[:1].numel() * value.element_size() if value.ndim else 0
         planned = next((s.state[name] for s in touch.plan.sensors if s.name == sensor), None)
         if planned is None:
-            found["state"] += size if path in ("clock/episode", "clock/age") else 0
+            sizes["state"] += size if path in ("clock/episode", "clock/age") else 0
         elif planned.past:
             ring_calls = max(ring_calls, value.shape[1])
-            found["ring"] += size // value.shape[1]
+            sizes["ring"] += size // value.shape[1]
         else:
-            found["anchors" if name in ANCHORS else "state"] += size
+            sizes["anchors" if name in ANCHORS else "state"] += size
             num_anchors += math.prod(planned.shape) if name == ANCHORS[0] else 0
     return Bytes(
-        inputs=sum(value[:1].numel() * value.element_size() for value in given),
+        inputs=sum(value[:1].numel() * value.element_size() for value in inputs),
         outputs=4 * sum(math.prod(output.shape) for output in touch.outputs),
-        state=found["state"],
-        anchors=found["anchors"],
-        ring_entry=found["ring"],
+        state=sizes["state"],
+        anchors=sizes["anchors"],
+        ring_entry=sizes["ring"],
         ring_calls=ring_calls,
         num_taxels=sum(sensor.readings[0].num_rows for sensor in touch.plan.sensors),
         num_anchors=num_anchors,

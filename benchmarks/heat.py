@@ -1,23 +1,23 @@
-"""Temperatures: a call on a GPU, whether it reads what float64 does and keeps heat; conduction on a CPU.
+"""Measure `temperature_grid`: time, error and conserved energy of a call on a GPU; conduction on a CPU.
 
-    python benchmarks/heat.py artefacts out/heat                            # where documents can be compiled
+    python benchmarks/heat.py artefacts out/heat                            # on any machine with tgdsl
     python benchmarks/heat.py run out/heat --out out/heat.json --jobs 8     # on the machine with the GPU
     python benchmarks/heat.py table out/heat.json                           # for docs/background/performance.md
     python benchmarks/heat.py conduction --out out/heat_conduction.json     # on a CPU, one thread
 
-`run` needs torch and what `tgdsl.load` needs, no more; `--device cpu --eager --envs 4 --repeats 1 --steps 80` tries it out.
-Each part has a process of its own, and they take turns on the GPU: see turns.py. Parts are a case and what is done with it:
+`run` needs only torch and the dependencies of `tgdsl.load`; `--device cpu --eager --envs 4 --repeats 1 --steps 80` tries it.
+Each part, a case with a measurement, runs in a separate process, and processes take turns on the GPU: see turns.py.
 
-- `kernel`, `definition`: three calls in a row against a float64 module, plain and compiled; then the time of a replayed CUDA
-  graph of calls on so many sets of inputs and state that they exceed the GPU's L2 cache, and what its kernels take, once with
-  the kernel of a step and once with its definition in torch;
-- `energy`: replayed calls whose contacts come and go: what all store, against what the reports say came in, summed in float64,
-  over the heat that was exchanged;
-- `sweep`: the kernel alone, by how many pairs a program has, and numbers a warp.
+- `kernel`, `definition`: the error of three successive calls, plain and compiled, against a float64 module; the time of a
+  replayed CUDA graph of calls on enough sets of inputs and state to exceed the GPU's L2 cache; and the times of its kernels.
+  The step is the Triton kernel or its definition in torch.
+- `energy`: replayed calls with changing contacts; stored heat minus the reported exchange, summed in float64, over the total
+  exchange.
+- `sweep`: the kernel alone, by pairs per program and numbers per warp.
 
-Five links of 2 × 2 × 2 cells or 10 × 10 × 10; unless a case leaves it out there are a source, radiation, convection, a lag, and
-contact: each link touches one object at a random point. `conduction` sets a step of `exact` beside the paper's: mirror the
-cells, transform, divide, transform back, crop.
+There are five links of 2 × 2 × 2 or 10 × 10 × 10 cells. Unless a case leaves them out there are a source, radiation,
+convection, a lag, and contact: each link touches one object at a random point. `conduction` compares a step of `exact` with the
+paper's: mirror the cells, transform, divide, transform back, crop.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from gpu import (
     synchronize,
 )
 from gpu_scenes import Case, bytes_of
-from heat_cases import CASES, artefact, exchanged, gained, make_artefacts, state_of, stored
+from heat_cases import artefact, exchanged, gained, make_artefacts, state_of, stored
 
 from tgdsl.module.artifact import load_plan
 from tgdsl.module.module import TactileModule
@@ -71,71 +71,67 @@ PARTS = (
     ("contact alone", "kernel"),
     ("all", "sweep"),
 )
-"""What `run` does, in this order."""
+"""The parts of `run`: case and measurement, in order."""
 SWEPT = ((16, 128), (32, 128), (32, 256), (64, 256), (64, 512), (128, 256), (128, 512))
-"""Pairs of an environment and a row in a program, and numbers of each of its warps."""
+"""Pairs (of an environment and a row) per program, and numbers per warp."""
 CHECKED, PROFILED, ENERGY_ENVS, LARGE = 64, 3, 1_024, 1e9
-"""Environments whose readings are compared; calls that are profiled; environments of `energy`; bytes of state from which on
-calls from Python are not timed."""
-HOW, SHOWN = ("kernel", "definition", "energy", "sweep"), 12
-"""Kinds of parts; kernels that are listed."""
+"""Environments whose readings are compared; profiled calls; environments of `energy`; bytes of state above which calls from
+Python are not timed."""
+LISTED = 12
+"""Kernels that are listed."""
 CYCLE = 8
-"""States that `energy` goes through again and again."""
+"""States in the cycle of `energy`."""
 
 
 # Times ----------------------------------------------------------------------------------------------------------------------
 
 
-def benches(options: argparse.Namespace, name: str) -> Bench:
-    """Return a case with its code, compiled at its first call, which takes the turn."""
+def bench_of(options: argparse.Namespace, name: str) -> Bench:
+    """Return a case, whose code is compiled at its first call, which takes the turn."""
     plan, turn = load_plan(artefact(options.folder, name)), turns.Turn(options.turn)
     return Bench.of(Case(name, "temperature_grid"), plan, turn, options)
 
 
 def kernels(call: Callable[[], Any], device: torch.device) -> dict[str, tuple[float, float]]:
-    """Return of each kernel of a call how often it runs and how long in all [ms], by name; nothing on a CPU."""
+    """Return the number of launches and the total time [ms] of each kernel of a call, by name; nothing on a CPU."""
     if device.type != "cuda":
         return {}
     from torch.profiler import ProfilerActivity, profile
 
     call()
-    with profile(activities=[ProfilerActivity.CUDA]) as seen:
+    with profile(activities=[ProfilerActivity.CUDA]) as profiler:
         for _ in range(PROFILED):
             call()
         torch.cuda.synchronize()
-    found: dict[str, tuple[float, float]] = {}
-    for event in seen.events() or ():
+    result: dict[str, tuple[float, float]] = {}
+    for event in profiler.events() or ():
         if event.device_time_total > 0:
-            count, ms = found.get(event.name, (0.0, 0.0))
-            found[event.name] = count + 1 / PROFILED, ms + event.device_time_total / (1e3 * PROFILED)
-    return dict(sorted(found.items(), key=lambda item: -item[1][1]))
+            count, ms = result.get(event.name, (0.0, 0.0))
+            result[event.name] = count + 1 / PROFILED, ms + event.device_time_total / (1e3 * PROFILED)
+    return dict(sorted(result.items(), key=lambda item: -item[1][1]))
 
 
-def errors(bench: Bench, core: bool) -> list[float]:
-    """Return the 99.9 % quantile and the largest of the errors of calls in a row, against a float64 module on the CPU.
-
-    Args:
-        bench: The case.
-        core: Whether its compiled code is called; otherwise the module as it is.
-    """
-    exact, plain = TactileModule(bench.plan, dtype=torch.float64), TactileModule(bench.plan).to(bench.device)
+def errors(bench: Bench, touch: TactileModule) -> list[float]:
+    """Return the 99.9 % quantile and the largest error of successive calls, against a float64 module on the CPU."""
+    exact = TactileModule(bench.plan, dtype=torch.float64)
     states = [state_of(exact, CHECKED, seed, share=0.7) for seed in range(100, 100 + CALLS)]
-    want = readings_of(exact, [state.to("cpu", torch.float64) for state in states])
-    found = readings_of(bench.module() if core else plain, [state.to(bench.device) for state in states])
-    error = full_scale_errors(exact.outputs, found, want)
+    expected = readings_of(exact, [state.to("cpu", torch.float64) for state in states])
+    readings = readings_of(touch, [state.to(bench.device) for state in states])
+    error = full_scale_errors(exact.outputs, readings, expected)
     return [float(np.quantile(error, 0.999, method="higher")), float(error.max())]
 
 
 def run_time(options: argparse.Namespace, name: str) -> Iterator[dict[str, Any]]:
-    """Check and time a case; what is known is handed out after each step, so that a failure keeps what was before it."""
-    start, bench = time.perf_counter(), benches(options, name)
-    row: dict[str, Any] = {"takes_kernel": step_takes_kernel(bench), "plain_error": errors(bench, False)}
+    """Check and time a case; yield the row after each step, so that a failure loses nothing before it."""
+    start, bench = time.perf_counter(), bench_of(options, name)
+    plain = TactileModule(bench.plan).to(bench.device)
+    row: dict[str, Any] = {"takes_kernel": step_takes_kernel(bench), "plain_error": errors(bench, plain)}
     yield row
     touch, size, device, num = bench.module(), bytes_of(TactileModule(bench.plan)), bench.device, options.envs
     states = [state_of(touch, num, seed).to(device) for seed in range(3)]
     for state in states:
         touch(state)
-    row |= {"error": errors(bench, True), "ready": time.perf_counter() - start, "mb": num * size.moved / 1e6}
+    row |= {"error": errors(bench, bench.module()), "ready": time.perf_counter() - start, "mb": num * size.moved / 1e6}
     yield row
     sets = rotating(bench, touch, states, options.sets or num_sets(num * size.held))
     replay = captured(lambda: [bench.core(*one) for one in sets], device)
@@ -149,80 +145,81 @@ def run_time(options: argparse.Namespace, name: str) -> Iterator[dict[str, Any]]
 
 
 def step_takes_kernel(bench: Bench) -> bool:
-    """Return whether a step of a plain call launches the kernel."""
-    seen, own = [], HEAT_STEP.takes_kernel
-    object.__setattr__(HEAT_STEP, "takes_kernel", lambda *of: seen.append(own(*of)) or seen[-1])
+    """Return whether a plain call launches the kernel of a step."""
+    results, original = [], HEAT_STEP.takes_kernel
+    object.__setattr__(HEAT_STEP, "takes_kernel", lambda *inputs: results.append(original(*inputs)) or results[-1])
     try:
         touch = TactileModule(bench.plan).to(bench.device)
         touch(state_of(touch, 2, 0).to(bench.device))
     finally:
         object.__delattr__(HEAT_STEP, "takes_kernel")
-    return any(seen)
+    return any(results)
 
 
 def run_sweep(options: argparse.Namespace, name: str) -> Iterator[dict[str, Any]]:
-    """Time the kernel of a step alone, by numbers in a program and in a warp."""
+    """Time the kernel of a step alone, by pairs per program and numbers per warp."""
     from tgdsl.sensors.temperature_grid import step_kernel
 
-    bench, given = benches(options, name), []
-    touch, own = TactileModule(bench.plan).to(bench.device), step_kernel.heat_step
-    step_kernel.heat_step = lambda *arguments: given.append(arguments) or own(*arguments)
+    bench, calls = bench_of(options, name), []
+    touch, original = TactileModule(bench.plan).to(bench.device), step_kernel.heat_step
+    step_kernel.heat_step = lambda *arguments: calls.append(arguments) or original(*arguments)
     for seed in range(2):
         touch(state_of(touch, options.envs, seed).to(bench.device))
-    step_kernel.heat_step, found = own, {}
+    step_kernel.heat_step, times = original, {}
     turn = turns.Turn(options.turn)
-    for pairs, of_warp in SWEPT:
-        step_kernel.MAX_PAIRS, step_kernel.OF_WARP = pairs, of_warp
+    for pairs, numbers in SWEPT:
+        step_kernel.MAX_PAIRS, step_kernel.OF_WARP = pairs, numbers
         turn.give_back()
-        step_kernel.launch(step_kernel.step_kernel, *given[-1])
+        step_kernel.launch(step_kernel.step_kernel, *calls[-1])
         turn.take()
-        call = captured(lambda: [step_kernel.launch(step_kernel.step_kernel, *given[-1]) for _ in range(8)], bench.device)
-        found[f"{pairs} pairs a program, {of_warp} numbers a warp"] = median_ms(call, options.repeats, bench.device) / 8
-        yield {"sweep": found}
+        call = captured(lambda: [step_kernel.launch(step_kernel.step_kernel, *calls[-1]) for _ in range(8)], bench.device)
+        times[f"{pairs} pairs a program, {numbers} numbers a warp"] = median_ms(call, options.repeats, bench.device) / 8
+        yield {"sweep": times}
 
 
 # Energy ---------------------------------------------------------------------------------------------------------------------
 
 
 def run_energy(options: argparse.Namespace, name: str) -> Iterator[dict[str, Any]]:
-    """Replay calls whose contacts come and go; return what the reports do not explain of what is stored."""
-    bench, num_envs = benches(options, name), min(options.envs, ENERGY_ENVS)
+    """Replay calls with changing contacts; return the stored heat that the reports do not explain."""
+    bench, num_envs = bench_of(options, name), min(options.envs, ENERGY_ENVS)
     touch = bench.module()
     states = [state_of(touch, num_envs, seed, share=0.5).to(options.device) for seed in range(CYCLE)]
-    begun = stored(touch(states[0]))
+    start_heat = stored(touch(states[0]))
     sets = [
         (tensors, touch.memory.tensors(num_envs, DT, torch.float32, bench.device))
         for tensors, _ in rotating(bench, touch, states, CYCLE)
     ]
-    came, moved, last = (torch.zeros_like(begun) for _ in range(3))
+    gain, exchange, heat = (torch.zeros_like(start_heat) for _ in range(3))
 
     def cycle() -> None:
         for one in sets:
             readings = bench.core(*one)
-            came.add_(gained(readings))
-            moved.add_(exchanged(readings))
-        last.copy_(stored(readings))  # pyright: ignore[reportPossiblyUnboundVariable]
+            gain.add_(gained(readings))
+            exchange.add_(exchanged(readings))
+        heat.copy_(stored(readings))  # pyright: ignore[reportPossiblyUnboundVariable]
 
     replay = captured(cycle, bench.device)
     replay()
     synchronize(bench.device)
-    begun = last.clone()
-    came.zero_()
-    moved.zero_()
+    start_heat = heat.clone()
+    gain.zero_()
+    exchange.zero_()
     start = time.perf_counter()
     for _ in range(options.steps // CYCLE):
         replay()
     synchronize(bench.device)
-    error = ((last - begun - came).abs() / moved).cpu()
+    unexplained = (heat - start_heat - gain).abs()
+    error = (unexplained / exchange).cpu()
     yield {
         "envs": num_envs,
         "steps": options.steps // CYCLE * CYCLE,
         "seconds": time.perf_counter() - start,
         "largest": float(error.max()),
         "median": float(error.median()),
-        "whole": float((last - begun - came).abs().sum() / moved.sum()),
-        "exchanged_joules": float(moved.mean()),
-        "stored_joules": float(last.mean()),
+        "whole": float(unexplained.sum() / exchange.sum()),
+        "exchanged_joules": float(exchange.mean()),
+        "stored_joules": float(heat.mean()),
         "is_finite": bool(error.isfinite().all()),
     }
 
@@ -231,12 +228,12 @@ def run_energy(options: argparse.Namespace, name: str) -> Iterator[dict[str, Any
 
 
 def run(options: argparse.Namespace) -> None:
-    """Do all parts; one that fails is reported, and the others go on."""
+    """Measure all parts; report a failure and go on."""
     if options.child:
         return child(options)
     start, rows = time.perf_counter(), []
-    for part, said, out in turns.children(options, ["--part"], [(f"{name}/{how}",) for name, how in chosen(options)]):
-        print(f"{part[0]}: not begun" if said is None else said, end="\n" if said is None else "", flush=True)
+    for (part,), output, out in turns.children(options, ["--part"], [(f"{name}/{how}",) for name, how in PARTS]):
+        print(f"{part}: not measured\n" if output is None else output, end="", flush=True)
         rows += json.loads(out.read_text())["rows"] if out.exists() else []
         write(options, {"seconds": time.perf_counter() - start, "rows": rows})
     print("\n".join(table_of(rows)))
@@ -244,41 +241,37 @@ def run(options: argparse.Namespace) -> None:
     return None
 
 
-def chosen(options: argparse.Namespace) -> list[tuple[str, str]]:
-    """Return the parts that are wanted."""
-    return [(name, how) for name, how in PARTS if how in options.how and (not options.cases or name in options.cases)]
-
-
 def child(options: argparse.Namespace) -> None:
-    """Do one part, and write down what is known after each of its steps."""
+    """Measure a part, and write its row after each step."""
     name, how = options.part.split("/")
     if how == "definition":
         object.__setattr__(HEAT_STEP, "condition", lambda *_: False)
-    made, row = {"energy": run_energy, "sweep": run_sweep}.get(how, run_time), {"case": name, "how": how, "envs": options.envs}
+    measurement, row = {"energy": run_energy, "sweep": run_sweep}.get(how, run_time), {"case": name, "how": how}
+    row["envs"] = options.envs
     try:
         with torch.no_grad():
-            for found in made(options, name):
-                row |= found
+            for numbers in measurement(options, name):
+                row |= numbers
                 write(options, {"rows": [row]})
-    except Exception:  # of one part: what it has found so far is wanted all the same
+    except Exception:  # the numbers so far are still worth reporting
         print(f"{options.part}: FAILED\n{traceback.format_exc()[-3000:]}", flush=True)
-    print(f"{options.part}: {told(row)}", flush=True)
+    print(f"{options.part}: {text(row)}", flush=True)
     turns.end()
 
 
-def told(row: dict[str, Any]) -> str:
-    """Return a row in a line, and its kernels in some more."""
+def text(row: dict[str, Any]) -> str:
+    """Return a row in one line, and its kernels below."""
     numbers = {key: value for key, value in row.items() if key not in ("case", "how", "kernels")}
     lines = [
         "  ".join(f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in numbers.items())
     ]
-    for name, (count, ms) in list(row.get("kernels", {}).items())[:SHOWN]:
+    for name, (count, ms) in list(row.get("kernels", {}).items())[:LISTED]:
         lines.append(f"    {ms:.4f} ms  {count:.0f} ×  {name[:140]}")
     return "\n".join(lines)
 
 
 def table_of(rows: list[dict[str, Any]]) -> list[str]:
-    """Return the docs' table."""
+    """Return the lines of the docs' table."""
     lines = ["| case | step by | error (largest) | call [ms] | replayed [ms] | must move [MB] | kernels | sum [ms] |"]
     lines.append("|---" * 8 + "|")
     for row in rows:
@@ -303,43 +296,41 @@ def run_conduction(options: argparse.Namespace) -> None:
     write(options, {"rows": heat_conduction.timed(options.cells, options.envs, options.repeats)})
 
 
-def write(options: argparse.Namespace, found: dict[str, Any]) -> None:
+def write(options: argparse.Namespace, results: dict[str, Any]) -> None:
     if options.out is not None:
         options.out.parent.mkdir(parents=True, exist_ok=True)
         where = torch.cuda.get_device_name() if getattr(options, "device", "cpu") != "cpu" else "CPU"
-        options.out.write_text(json.dumps({"device": where, "torch": torch.__version__, **found}, indent=1) + "\n")
+        options.out.write_text(json.dumps({"device": where, "torch": torch.__version__, **results}, indent=1) + "\n")
 
 
 def main() -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
-    own = commands.add_parser("artefacts")
-    own.set_defaults(call=make_artefacts)
-    own.add_argument("folder", type=Path)
-    own = commands.add_parser("run")
-    own.set_defaults(call=run)
-    own.add_argument("folder", type=Path)
-    own.add_argument("--device", default="cuda")
-    own.add_argument("--eager", action="store_true", help="leave the modules uncompiled")
-    own.add_argument("--envs", type=int, default=16_384)
-    own.add_argument("--out", type=Path)
-    own.add_argument("--cases", nargs="+", choices=CASES, help="these alone")
-    own.add_argument("--how", nargs="+", choices=HOW, default=HOW, help="these parts alone")
-    own.add_argument("--part", help="case/part: what a process of its own does")
-    own.add_argument("--repeats", type=int, default=30)
-    own.add_argument("--steps", type=int, default=100_000, help="calls of `energy`")
-    own.add_argument("--sets", type=int, help="sets of buffers at most")
-    turns.add_options(own)
-    own = commands.add_parser("table")
-    own.set_defaults(call=run_table)
-    own.add_argument("file", type=Path)
-    own = commands.add_parser("conduction")
-    own.set_defaults(call=run_conduction)
-    own.add_argument("--cells", nargs="+", type=int, default=[2, 3, 4, 6, 8, 10])
-    own.add_argument("--envs", type=int, default=256)
-    own.add_argument("--repeats", type=int, default=20)
-    own.add_argument("--out", type=Path)
+    command = commands.add_parser("artefacts")
+    command.set_defaults(call=make_artefacts)
+    command.add_argument("folder", type=Path)
+    command = commands.add_parser("run")
+    command.set_defaults(call=run)
+    command.add_argument("folder", type=Path)
+    command.add_argument("--device", default="cuda")
+    command.add_argument("--eager", action="store_true", help="leave the modules uncompiled")
+    command.add_argument("--envs", type=int, default=16_384)
+    command.add_argument("--out", type=Path)
+    command.add_argument("--part", help="case/measurement of a process with `--child`")
+    command.add_argument("--repeats", type=int, default=30)
+    command.add_argument("--steps", type=int, default=100_000, help="calls of `energy`")
+    command.add_argument("--sets", type=int, help="sets of buffers, instead of enough to exceed the L2")
+    turns.add_options(command)
+    command = commands.add_parser("table")
+    command.set_defaults(call=run_table)
+    command.add_argument("file", type=Path)
+    command = commands.add_parser("conduction")
+    command.set_defaults(call=run_conduction)
+    command.add_argument("--cells", nargs="+", type=int, default=[2, 3, 4, 6, 8, 10])
+    command.add_argument("--envs", type=int, default=256)
+    command.add_argument("--repeats", type=int, default=20)
+    command.add_argument("--out", type=Path)
     options = parser.parse_args(namespace=argparse.Namespace(arguments=[__file__, *sys.argv[1:]]))
     options.call(options)
 

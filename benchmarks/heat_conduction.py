@@ -1,4 +1,4 @@
-"""Conduction on a CPU: a step of `exact` beside the paper's, for `heat.py conduction`."""
+"""Conduction on a CPU: a step of `exact` against the paper's, for `heat.py conduction`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tgdsl.quantities.patches import modes
 from tgdsl.sensors.temperature_grid import diffusion
 
 LINKS, BLOCK = 5, 5
-"""Boxes; calls that are timed together."""
+"""Boxes, and calls per timed block."""
 
 
 class Mirrored(torch.nn.Module):
@@ -24,22 +24,20 @@ class Mirrored(torch.nn.Module):
     def __init__(self, rate: Tensor, num: int):
         """Take αΔt/L² of each row, and the number of cells along each axis."""
         super().__init__()
-        place = torch.fft.fftfreq(2 * num, 1.0 / (2 * num)).abs(), torch.fft.rfftfreq(2 * num, 1.0 / (2 * num))
-        k = torch.pi * place[0], torch.pi * place[0], torch.pi * place[1]
-        square = k[0][:, None, None] ** 2 + k[1][:, None] ** 2 + k[2] ** 2
+        k, last = (torch.pi * f(2 * num, 1.0 / (2 * num)) for f in (torch.fft.fftfreq, torch.fft.rfftfreq))
+        square = k[:, None, None] ** 2 + k[:, None] ** 2 + last**2
         self.divisor, self.num = 1.0 + rate[:, None, None, None] * square, num
 
     def forward(self, cells: Tensor) -> Tensor:
         """Return the cells after a step."""
         for axis in (2, 3, 4):
             cells = torch.cat([cells, cells.flip(axis)], dim=axis)
-        modes_of = torch.fft.rfftn(cells, dim=(2, 3, 4)) / self.divisor
-        made = torch.fft.irfftn(modes_of, s=cells.shape[2:], dim=(2, 3, 4))
-        return made[:, :, : self.num, : self.num, : self.num]
+        spectrum = torch.fft.rfftn(cells, dim=(2, 3, 4)) / self.divisor
+        return torch.fft.irfftn(spectrum, s=cells.shape[2:], dim=(2, 3, 4))[:, :, : self.num, : self.num, : self.num]
 
 
 class Exact(torch.nn.Module):
-    """A step of `exact`, with its operators of each Δt."""
+    """A step of `exact`, which computes its operators from Δt."""
 
     def __init__(self, rate: Tensor, num: int):
         """Take αΔt/L² of each row, and the number of cells along each axis."""
@@ -57,7 +55,7 @@ class Exact(torch.nn.Module):
 
 
 def timed(numbers: Sequence[int], num_envs: int, repeats: int) -> list[dict[str, Any]]:
-    """Take the CPU time of both in turn, at some numbers of cells, print what is found, and return it."""
+    """Return and print the CPU times of alternating steps, a row per number of cells."""
     torch.set_num_threads(1)
     rows = []
     print("cells  mirrored [ms]  exact, eager [ms]  compiled [ms]  ratio, eager  compiled")
@@ -68,15 +66,15 @@ def timed(numbers: Sequence[int], num_envs: int, repeats: int) -> list[dict[str,
         check(mirrored, exact, cells[:4], rate)
         torch.compiler.reset()
         calls = {"mirrored": mirrored, "eager": exact, "compiled": torch.compile(exact, fullgraph=True)}
-        took: dict[str, list[float]] = {name: [] for name in calls}
+        times: dict[str, list[float]] = {name: [] for name in calls}
         with torch.no_grad():
             for i in range(repeats + 2):
                 for name, call in calls.items():
                     start = time.thread_time()
                     for _ in range(BLOCK):
                         call(cells)
-                    took[name] += [1e3 * (time.thread_time() - start) / BLOCK] if i >= 2 else []
-        ms = {name: statistics.median(own) for name, own in took.items()}
+                    times[name] += [1e3 * (time.thread_time() - start) / BLOCK] if i >= 2 else []
+        ms = {name: statistics.median(values) for name, values in times.items()}
         rows.append({"cells": num, "envs": num_envs, **ms, "ratio": ms["mirrored"] / ms["compiled"]})
         ratios = (ms["mirrored"] / ms[name] for name in ("eager", "compiled"))
         print(f"{num}³  " + "  ".join(f"{value:.3f}" for value in ms.values()) + "  " + "  ".join(f"{r:.1f}" for r in ratios))
@@ -84,7 +82,7 @@ def timed(numbers: Sequence[int], num_envs: int, repeats: int) -> list[dict[str,
 
 
 def check(mirrored: Mirrored, exact: Exact, cells: Tensor, rate: Tensor) -> None:
-    """See that the mirrored step is that of `semi_implicit`, and that `exact` keeps the sum."""
+    """Assert that the mirrored step equals `semi_implicit`, and that `exact` conserves the sum."""
     num = mirrored.num
     k = torch.pi * torch.arange(num)
     smooth = (exact.modes._replace(exponent=(k * k).expand(LINKS, -1)),) * 3

@@ -1,9 +1,9 @@
-"""The module alone: component planes against the same equations with 3-vectors, eager and compiled.
+"""Compare the module's component planes with the same equations in 3-vectors, eager and compiled.
 
     python benchmarks/module.py [--device cuda] [--num-envs 1024] [--repeats 30]
 
-Feeds random states to `kinematic_taxel` (force and torque) on a 10 × 10 pad and on the XHand1 (199 taxels), first compares both
-ways with each other, then times them in turn and prints medians and their ratio.
+Reads random states by `kinematic_taxel` (force and torque) on a 10 × 10 pad and on the XHand1 (199 taxels). The readings of
+both must agree; then calls alternate, and medians and their ratio are printed.
 """
 
 from __future__ import annotations
@@ -34,12 +34,10 @@ PAD = """
 
 @dataclass(frozen=True)
 class Options:
-    """What to time."""
+    """The command line."""
 
     device: str = "cpu"
-    """Where."""
     num_envs: int = 1024
-    """Environments."""
     repeats: int = 30
     """Timed calls of each variant."""
 
@@ -60,7 +58,7 @@ def pad_module(device: str) -> TactileModule:
 
 
 def hand_module(device: str) -> TactileModule:
-    """Return `kinematic_taxel` on the XHand1 at medium resolution, a cube in its palm."""
+    """Return `kinematic_taxel` on the XHand1 at medium resolution, with a cube on its palm."""
     example = Path(__file__).parent.parent / "examples" / "xhand1_palm.yaml"
     only_touch = {"sensors": "{touch: {kind: kinematic_taxel, links: hand, feels: [cube]}}", "observations": "{}"}
     return tgdsl.compile(example, overrides=only_touch, device=device)
@@ -78,17 +76,16 @@ def rotation_matrix(quat: Tensor) -> Tensor:
 
 
 class VectorTaxels(torch.nn.Module):
-    """The kinematic taxel against one centred box, written with trailing-axis vectors and 3 × 3 products."""
+    """The kinematic taxel against one centred box, with 3-vectors in the last axis and 3 × 3 products."""
 
     def __init__(self, touch: TactileModule):
-        """Take the numbers of a module whose only sensor is `touch`."""
+        """Take the constants of a module whose only sensor is `touch`."""
         super().__init__()
         plan, device = touch.plan, touch.device
         layout = plan.layout_of(plan.sensors[0])
         bodies = plan.inputs.bodies
         links = [bodies.index(layout.links[i].body) for i in layout.link_id]
-        pairs = [plan.inputs.pairs.index(p) for p in plan.inputs.pairs]
-        pair_of = {pair.link: i for i, pair in zip(pairs, plan.inputs.pairs, strict=True)}
+        pair_of = {pair.link: i for i, pair in enumerate(plan.inputs.pairs)}
         self.link = torch.tensor(links, device=device)
         self.pair = torch.tensor([pair_of[layout.links[i].body] for i in layout.link_id], device=device)
         self.cube = bodies.index("cube")
@@ -97,7 +94,7 @@ class VectorTaxels(torch.nn.Module):
         (geoms,) = plan.quantities["contact_depth"].geoms
         self.half_size = torch.tensor(geoms.size[0, 0], dtype=torch.float32, device=device)
 
-    def forward(self, pos: Tensor, quat: Tensor, linvel: Tensor, angvel: Tensor, found: Tensor) -> Tensor:
+    def forward(self, pos: Tensor, quat: Tensor, linvel: Tensor, angvel: Tensor, contact_found: Tensor) -> Tensor:
         """Return force and torque (env, taxel, 6)."""
         rotation = rotation_matrix(quat)
         link, cube = rotation[:, self.link], rotation[:, self.cube, None]
@@ -111,11 +108,11 @@ class VectorTaxels(torch.nn.Module):
         sign = torch.where(local < 0, -1.0, 1.0)
         face = torch.nn.functional.one_hot(beyond.argmax(dim=-1), 3)
         gradient = sign * torch.where(outside[..., None] > 0, beyond.clamp(min=0) / outside[..., None].clamp(min=1e-15), face)
-        depth = (self.radius - torch.where(outside > 0, outside, inside)).clamp(min=0) * (found[:, self.pair] > 0)
+        depth = (self.radius - torch.where(outside > 0, outside, inside)).clamp(min=0) * (contact_found[:, self.pair] > 0)
         normal = (link.transpose(-1, -2) @ cube @ gradient[..., None]).squeeze(-1) * (depth > 0)[..., None]
-        of_cube = linvel[:, self.cube, None] + torch.linalg.cross(angvel[:, self.cube, None].expand_as(point), from_cube)
-        of_link = linvel[:, self.link] + torch.linalg.cross(angvel[:, self.link], arm)
-        velocity = (link.transpose(-1, -2) @ (of_cube - of_link)[..., None]).squeeze(-1) * (depth > 0)[..., None]
+        cube_velocity = linvel[:, self.cube, None] + torch.linalg.cross(angvel[:, self.cube, None].expand_as(point), from_cube)
+        link_velocity = linvel[:, self.link] + torch.linalg.cross(angvel[:, self.link], arm)
+        velocity = (link.transpose(-1, -2) @ (cube_velocity - link_velocity)[..., None]).squeeze(-1) * (depth > 0)[..., None]
         turn = (link.transpose(-1, -2) @ (angvel[:, self.cube, None] - angvel[:, self.link])[..., None]).squeeze(-1)
         strength = depth[..., None] ** 1.2
         along = (velocity * normal).sum(-1, keepdim=True) * normal
@@ -125,7 +122,7 @@ class VectorTaxels(torch.nn.Module):
 
 
 def median_ms(calls: dict[str, Callable[[], Any]], repeats: int, device: str) -> dict[str, float]:
-    """Time calls in turn, so that a drifting machine disturbs all alike; return medians [ms]."""
+    """Return the median times of alternating calls [ms]; a drift of the machine affects all of them."""
     times: dict[str, list[float]] = {name: [] for name in calls}
     with torch.no_grad():
         for i in range(repeats + 3):
@@ -142,7 +139,7 @@ def median_ms(calls: dict[str, Callable[[], Any]], repeats: int, device: str) ->
 
 
 def compare(name: str, touch: TactileModule, options: Options) -> None:
-    """Check and time both ways on one module."""
+    """Check and time both formulations on a module."""
     state = touch.example_state(options.num_envs, dtype=torch.float32)
     fields = ("body_pos", "body_quat", "body_linvel", "body_angvel", "contact_found")
     tensors = [getattr(state, field) for field in fields]
@@ -153,8 +150,8 @@ def compare(name: str, touch: TactileModule, options: Options) -> None:
     with torch.no_grad():
         for readings in (touch(state)["touch"], compiled(state)["touch"], compiled_vectors(*tensors)):
             error = ((readings - expected).abs().amax((0, 1)) / expected.abs().amax((0, 1))).max()
-            # 1e-4: from float32 world poses the vectors form q in the world and lose a digit there.
-            assert error < 1e-4, f"the two ways differ by {error:.1e} of full scale"
+            # 1e-4: the 3-vectors are differences of float32 positions in the world, which loses a digit.
+            assert error < 1e-4, f"the two formulations differ by {error:.1e} of full scale"
     calls = {
         "planes, eager": lambda: touch(SceneState(*tensors)),
         "vectors, eager": lambda: vectors(*tensors),
@@ -171,9 +168,9 @@ def compare(name: str, touch: TactileModule, options: Options) -> None:
 
 
 def main(options: Options) -> None:
-    """Run both cases."""
-    what = torch.cuda.get_device_name() if options.device == "cuda" else f"CPU, {torch.get_num_threads()} threads"
-    print(f"torch {torch.__version__}, {what}, medians of {options.repeats}")
+    """Compare on the pad and on the hand."""
+    machine = torch.cuda.get_device_name() if options.device == "cuda" else f"CPU, {torch.get_num_threads()} threads"
+    print(f"torch {torch.__version__}, {machine}, medians of {options.repeats}")
     compare("pad", pad_module(options.device), options)
     torch.compiler.reset()
     compare("xhand1", hand_module(options.device), options)

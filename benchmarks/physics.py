@@ -1,19 +1,19 @@
-"""Physics and touch end to end: MuJoCo Warp steps thousands of environments, the module reads them; what does touch cost?
+"""Measure the cost of touch in a control step: MuJoCo Warp steps thousands of environments, and a module reads them.
 
-    python benchmarks/physics.py artefacts out/physics                                # where documents can be compiled
+    python benchmarks/physics.py artefacts out/physics                                # on any machine with tgdsl
     python benchmarks/physics.py run out/physics --out out/physics.json --jobs 8      # on the machine with the GPU
     python benchmarks/physics.py run out/physics --out out/physics.json --profile --scenes hand-med --modules elastomer
     python benchmarks/physics.py plot out/physics.json --out docs/images/physics.png
 
 Scenes: the pyramid of ten cubes (examples/pyramid.yaml) and the XHand1 with a cube (examples/xhand1_palm.yaml) at 199 and 667
-taxels, with its own elliptic cone or a pyramidal one. `run` needs torch, MuJoCo Warp and what `tgdsl.load` needs, no more. Each
-module of a scene has a process of its own, `--jobs` of them at once, and they take turns on the GPU: see turns.py. Rows are
+taxels, with an elliptic or a pyramidal cone. `run` needs only torch, MuJoCo Warp and the dependencies of `tgdsl.load`. Each
+module of a scene runs in a separate process, `--jobs` at once, and processes take turns on the GPU: see turns.py. Rows are
 printed and written as processes end.
 
-A scene is first stepped without sensors, and some instants are kept. From each of them the module's control step is timed again
-and again, alternately with one without sensors: physics does the same work each time. Times are medians by CUDA events:
-`plain` is the step without sensors, `step` the same with touch in the same CUDA graph, `module` a graph of the module alone, on
-that state, and `read` one that gathers the state too. `--profile` lists the kernels of `module` as well, the longest first.
+A scene is first stepped without sensors, and some states are saved. From each of them, control steps with and without touch
+are timed alternately, so that physics does the same work. Times are medians by CUDA events: `plain` is the step without
+sensors, `step` the same with touch in the same CUDA graph, `module` a graph of the module alone on that state, and `read` a
+graph that gathers the state too. `--profile` also lists the kernels of `module`, the longest first.
 """
 
 from __future__ import annotations
@@ -43,12 +43,13 @@ from tgdsl.module.module import TactileModule
 from tgdsl.runtime.warp import WarpSimulation
 from tgdsl.scene.scene import scene_model
 
-# What is timed --------------------------------------------------------------------------------------------------------------
+INSTANTS = 4
+"""Saved states per scene."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One module at one number of environments; times [ms] of one control step, None where it could not be measured."""
+    """A module at one number of environments; times of a control step [ms]."""
 
     scene: str
     module: str
@@ -76,13 +77,13 @@ HEAD = (
 
 
 class Instants:
-    """States of a scene without sensors along a run, from which steps are timed."""
+    """Saved states along a run of a scene without sensors, from which steps are timed."""
 
-    KEPT = ("time", "qpos", "qvel", "act", "qacc_warmstart", "ctrl")
+    FIELDS = ("time", "qpos", "qvel", "act", "qacc_warmstart", "ctrl")
 
-    def __init__(self, sim: WarpSimulation, scene: Scene, count: int):
-        """Step the scene and keep instants: of the hand along a squeeze, of the pyramid while it settles."""
-        self._kept: list[dict[str, Tensor]] = []
+    def __init__(self, sim: WarpSimulation, scene: Scene):
+        """Step the scene and save states: of the hand along a squeeze, of the pyramid while it settles."""
+        self._states: list[dict[str, Tensor]] = []
         model, device = sim.model, sim.arrays["qpos"].device
         rest = squeeze = torch.zeros(model.nu, device=device)
         if scene.keyframe is None:
@@ -94,29 +95,26 @@ class Instants:
             )
         strength = torch.linspace(0.3, 1.2, sim.num_envs, device=device)[:, None]
         steps, every = (30, 5) if scene.keyframe is None else (60, 8)
-        for i in range(steps + every * count):
+        for i in range(steps + every * INSTANTS):
             sim.step(rest + (squeeze - rest) * strength * min(1.0, i / steps))
             if i >= steps and (i - steps) % every == 0:
-                self._kept.append({name: sim.arrays[name].clone() for name in self.KEPT})
+                self._states.append({name: sim.arrays[name].clone() for name in self.FIELDS})
         if fault := fault_of(sim):
-            print(f"  {sim.num_envs} environments, while they settle: {fault}")
-
-    def __len__(self) -> int:
-        return len(self._kept)
+            print(f"  {sim.num_envs} environments, while settling: {fault}")
 
     def restore(self, i: int, sim: WarpSimulation) -> None:
-        """Put environments where they were."""
-        for name, value in self._kept[i].items():
+        """Put environments into a saved state."""
+        for name, value in self._states[i].items():
             sim.arrays[name].copy_(value)
 
 
 def interval(call: Callable[[], Any], device: torch.device) -> Callable[[], float]:
-    """Start a call; return what gives its time [ms] when all is done."""
+    """Start a call; return a function that returns its time [ms] once the device is idle."""
     if device.type == "cpu":
         start = time.perf_counter()
         call()
-        taken = 1e3 * (time.perf_counter() - start)
-        return lambda: taken
+        elapsed = 1e3 * (time.perf_counter() - start)
+        return lambda: elapsed
     events = [torch.cuda.Event(enable_timing=True) for _ in range(2)]
     events[0].record()
     call()
@@ -130,7 +128,7 @@ def synchronize(device: torch.device) -> None:
 
 
 def replayed(call: Callable[[], Any], device: torch.device) -> Callable[[], Any]:
-    """Return a call as a CUDA graph; on a CPU as it is."""
+    """Return the replay of a call captured in a CUDA graph; on a CPU the call."""
     if device.type == "cpu":
         return call
     stream = torch.cuda.Stream()
@@ -141,7 +139,7 @@ def replayed(call: Callable[[], Any], device: torch.device) -> Callable[[], Any]
     torch.cuda.synchronize()
     graph = torch.cuda.CUDAGraph()
     gc.collect()
-    gc.disable()  # to free one of Warp's arrays would break the capture
+    gc.disable()  # freeing one of Warp's arrays would break the capture
     try:
         with torch.cuda.graph(graph, capture_error_mode="thread_local"):
             call()
@@ -151,7 +149,7 @@ def replayed(call: Callable[[], Any], device: torch.device) -> Callable[[], Any]
 
 
 def median_of(call: Callable[[], Any], repeats: int, device: torch.device, batch: int = 10) -> float:
-    """Return the median time of a call [ms], of batches of them."""
+    """Return the median time of a call [ms] over batches of calls."""
 
     def calls() -> None:
         for _ in range(batch):
@@ -160,35 +158,35 @@ def median_of(call: Callable[[], Any], repeats: int, device: torch.device, batch
     calls()
     times = [interval(calls, device) for _ in range(repeats)]
     synchronize(device)
-    return statistics.median(taken() for taken in times) / batch
+    return statistics.median(elapsed() for elapsed in times) / batch
 
 
 def paired(plain: WarpSimulation, sim: WarpSimulation, instants: Instants, repeats: int) -> tuple[float, float]:
-    """Return the median times [ms] of a step without sensors and of one with them, taken in turn from the same instants."""
+    """Return the median times [ms] of steps without and with sensors, which alternate from the same states."""
     times: tuple[list[Callable[[], float]], list[Callable[[], float]]] = ([], [])
     device = sim.arrays["qpos"].device
-    for own, call in ((plain, plain.step), (sim, sim.step_and_read)):
-        for _ in range(5):  # what the module remembers is made at the first, and the graph is captured two calls after that
-            instants.restore(0, own)
+    for simulator, call in ((plain, plain.step), (sim, sim.step_and_read)):
+        for _ in range(5):  # the first call allocates the module's memory, and the graph is captured two calls later
+            instants.restore(0, simulator)
             call()
     for _ in range(repeats):
-        for i in range(len(instants)):
-            for own, call, kept in ((plain, plain.step, times[0]), (sim, sim.step_and_read, times[1])):
-                instants.restore(i, own)
-                kept.append(interval(call, device))
+        for i in range(INSTANTS):
+            for simulator, call, series in ((plain, plain.step, times[0]), (sim, sim.step_and_read, times[1])):
+                instants.restore(i, simulator)
+                series.append(interval(call, device))
     synchronize(device)
-    first, second = (statistics.median(taken() for taken in own) for own in times)
+    first, second = (statistics.median(elapsed() for elapsed in series) for series in times)
     return first, second
 
 
 def profiled(call: Callable[[], Any], device: torch.device, calls: int = 5, most: int = 30) -> str:
-    """Return the kernels of a call as text: time of each in a call [ms], how often it runs, and its name."""
+    """Return a table of a call's kernels: total time [ms], number of launches, and name."""
     on_gpu = device.type == "cuda"
-    with profile(activities=[ProfilerActivity.CUDA if on_gpu else ProfilerActivity.CPU]) as found:
+    with profile(activities=[ProfilerActivity.CUDA if on_gpu else ProfilerActivity.CPU]) as profiler:
         for _ in range(calls):
             call()
         synchronize(device)
-    rows = [(e.self_device_time_total if on_gpu else e.self_cpu_time_total, e.count, e.key) for e in found.key_averages()]
+    rows = [(e.self_device_time_total if on_gpu else e.self_cpu_time_total, e.count, e.key) for e in profiler.key_averages()]
     rows = sorted((row for row in rows if row[0] > 0), reverse=True)
     times = [f"{time / 1e3 / calls:14.4f}{count / calls:7.1f}  {name[:100]}" for time, count, name in rows[:most]]
     total = f"{sum(row[0] for row in rows) / 1e3 / calls:14.4f}{sum(row[1] for row in rows) / calls:7.1f}  in all"
@@ -196,21 +194,19 @@ def profiled(call: Callable[[], Any], device: torch.device, calls: int = 5, most
 
 
 def simulation(touch: TactileModule, scene: Scene, num_envs: int, options: argparse.Namespace) -> WarpSimulation:
-    """Return environments of a scene; what goes wrong is asked for in the end, so that it does not disturb the timing."""
+    """Return environments of a scene; they do not poll for faults, which would disturb the timing: see `fault_of`."""
     model = scene_model(touch.plan.scene)
     if scene.is_pyramidal:
         model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     keys: dict[str, Any] = {"nconmax": scene.nconmax, "njmax": scene.njmax, "graph": not options.eager}
     keys |= {"substeps": scene.substeps, "keyframe": scene.keyframe, "model": model, "device": options.device}
     sim = WarpSimulation(touch, num_envs, **keys)
-    if options.native_ccd:
-        sim.warp_model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
     sim._faults.polled = lambda: (False, [])
     return sim
 
 
 def fault_of(sim: WarpSimulation) -> str:
-    """Return what has gone wrong, in words."""
+    """Return the message of a fault so far, or nothing."""
     try:
         sim.check()
     except SimulationError as error:
@@ -219,7 +215,7 @@ def fault_of(sim: WarpSimulation) -> str:
 
 
 def compiled_module(scene: Scene, module: str, options: argparse.Namespace) -> TactileModule:
-    """Return a module whose code is compiled, for the most environments, and which has the turn."""
+    """Return a module compiled for the largest number of environments; this process has the turn then."""
     turn = turns.Turn(options.turn)
     turn.take()
     touch = tgdsl.load(artefact(options.folder, scene, module), device=options.device)
@@ -238,21 +234,21 @@ def compiled_module(scene: Scene, module: str, options: argparse.Namespace) -> T
 
 
 def free_memory(options: argparse.Namespace) -> None:
-    """Free what nothing refers to: others need the memory."""
+    """Free unused memory on the GPU for other processes."""
     gc.collect()
     if options.device != "cpu":
         torch.cuda.empty_cache()
 
 
 def measure(name: str, module: str, compiled: TactileModule, num_envs: int, options: argparse.Namespace) -> Row:
-    """Time one module on so many environments."""
+    """Time a module at one number of environments."""
     scene, device = SCENES[name], torch.device(options.device)
-    nothing, touch = (tgdsl.load(artefact(options.folder, scene, own), device=options.device) for own in (PLAIN, module))
-    plain = simulation(nothing, scene, num_envs, options)
-    instants = Instants(plain, scene, options.instants)
-    touch.calls.compiled = compiled.calls.compiled  # code for one number of environments serves for all
+    unread, touch = (tgdsl.load(artefact(options.folder, scene, file), device=options.device) for file in (PLAIN, module))
+    plain = simulation(unread, scene, num_envs, options)
+    instants = Instants(plain, scene)
+    touch.calls.compiled = compiled.calls.compiled  # code for one number of environments serves all
     sim = simulation(touch, scene, num_envs, options)
-    before, step = paired(plain, sim, instants, options.repeats)
+    plain_step, step = paired(plain, sim, instants, options.repeats)
     fault = fault_of(sim)
     contacts = int(sim.warp_data.nacon.numpy()[0]) / sim.num_envs
     state = sim.state()
@@ -262,25 +258,25 @@ def measure(name: str, module: str, compiled: TactileModule, num_envs: int, opti
         print(profiled(graph, device), flush=True)
     read = median_of(replayed(lambda: touch(sim.state()), device), options.repeats, device)
     rows = touch.outputs[0].shape[0] if module != "link_contact" else len(touch.taxels["s0"]["link"])
-    return Row(name, module, num_envs, scene.substeps, rows, before, step, alone, read, contacts, fault)
+    return Row(name, module, num_envs, scene.substeps, rows, plain_step, step, alone, read, contacts, fault)
 
 
 def rows_of(name: str, module: str, options: argparse.Namespace) -> Iterator[Row]:
-    """Time one module of a scene at each number of environments; one that fails is reported, and the others go on."""
+    """Time a module of a scene at each number of environments; report a failure and go on."""
     compiled = compiled_module(SCENES[name], module, options)
     for num_envs in options.envs:
         free_memory(options)
         try:
             with torch.no_grad():
                 row = measure(name, module, compiled, num_envs, options)
-        except Exception:  # of one number: the others are wanted all the same
+        except Exception:  # the other numbers of environments are still worth measuring
             print(f"  {num_envs:>6} {module}: FAILED\n{traceback.format_exc()}", flush=True)
         else:
             yield row
 
 
 def run(options: argparse.Namespace) -> None:
-    """Time scenes' modules and write what was measured; stop in time and say what is left."""
+    """Time the modules of scenes and write their rows; report those for which no time is left."""
     if options.child:
         for row in rows_of(options.scenes[0], options.modules[0], options):
             print(row.line(), flush=True)
@@ -291,14 +287,14 @@ def run(options: argparse.Namespace) -> None:
     versions = {"torch": torch.__version__, "mujoco": mujoco.__version__, "device": where}
     print(f"torch {torch.__version__}, MuJoCo {mujoco.__version__}, {where}, medians of {options.repeats}", flush=True)
     cases = [(name, module) for name in options.scenes for module in SCENES[name].modules if module in options.modules]
-    for (name, module), said, out in turns.children(options, ["--scenes", "--modules"], cases):
-        if said is None:
+    for (name, module), output, out in turns.children(options, ["--scenes", "--modules"], cases):
+        if output is None:
             left.append(f"{name} {module}")
             continue
         if name != last:
             print(f"\n{name}: control steps of {SCENES[name].substeps} physics steps, times [ms], shares of the step\n{HEAD}")
         last = name
-        print(said, end="", flush=True)
+        print(output, end="", flush=True)
         if out.exists():
             write(options.out, load_rows(out), versions)
     print(f"{time.perf_counter() - start:.0f} s" + (f"; not measured: {'; '.join(left)}" if left else ""))
@@ -309,18 +305,18 @@ def load_rows(path: Path) -> list[Row]:
 
 
 def write(path: Path, rows: list[Row], versions: dict[str, str]) -> None:
-    """Write rows to a JSON file, in the place of those of the same measurements that it holds."""
-    done = {(row.scene, row.module, row.num_envs) for row in rows}
-    kept = [row for row in load_rows(path) if (row.scene, row.module, row.num_envs) not in done] if path.exists() else []
+    """Write rows to a JSON file; they replace earlier rows of the same measurements."""
+    keys = {(row.scene, row.module, row.num_envs) for row in rows}
+    old = [row for row in load_rows(path) if (row.scene, row.module, row.num_envs) not in keys] if path.exists() else []
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({**versions, "rows": [asdict(row) for row in (*kept, *rows)]}, indent=1))
+    path.write_text(json.dumps({**versions, "rows": [asdict(row) for row in (*old, *rows)]}, indent=1))
 
 
 # The plot -------------------------------------------------------------------------------------------------------------------
 
 
 def plot(options: argparse.Namespace) -> None:
-    """Draw throughput against environments, and what touch adds to a step, one column per scene."""
+    """Draw throughput and the module's share of a step against environments, one column per scene."""
     from matplotlib import colormaps
     from matplotlib.figure import Figure
 
@@ -331,18 +327,17 @@ def plot(options: argparse.Namespace) -> None:
     colours = [colormaps["tab20"](i) for i in range(len(MODULES))]
     lines: dict[str, Any] = {}
     for column, name in enumerate(names):
-        own = [row for row in rows if row.scene == name]
-        envs = sorted({row.num_envs for row in own})
-        plain = [statistics.median(row.plain for row in own if row.num_envs == n) for n in envs]
+        of_scene = [row for row in rows if row.scene == name]
+        envs = sorted({row.num_envs for row in of_scene})
+        plain = [statistics.median(row.plain for row in of_scene if row.num_envs == n) for n in envs]
         panels[0, column].plot(envs, [1e3 * n / ms for n, ms in zip(envs, plain, strict=True)], "k--", label="no sensors")
         for module, colour in zip(MODULES, colours, strict=True):
-            found = sorted((row for row in own if row.module == module), key=lambda row: row.num_envs)
-            if not found:
-                continue
-            at = [row.num_envs for row in found]
+            curve = sorted((row for row in of_scene if row.module == module), key=lambda row: row.num_envs)
+            x = [row.num_envs for row in curve]
             style = {"color": colour, "marker": "o" if MODULES[module][1] is None else "^", "markersize": 4}
-            panels[0, column].plot(at, [1e3 * row.num_envs / row.step for row in found], label=module, **style)
-            panels[1, column].plot(at, [100 * row.module_alone / row.step for row in found], **style)
+            if curve:
+                panels[0, column].plot(x, [1e3 * row.num_envs / row.step for row in curve], label=module, **style)
+                panels[1, column].plot(x, [100 * row.module_alone / row.step for row in curve], **style)
         lines |= {line.get_label(): line for line in panels[0, column].get_lines()}
         panels[0, column].set(title=name, xscale="log", yscale="log", ylabel="environments' control steps per second")
         panels[1, column].set(xscale="log", yscale="log", xlabel="environments", ylabel="the module's time, % of the step")
@@ -356,27 +351,25 @@ def plot(options: argparse.Namespace) -> None:
 
 
 def parsed() -> argparse.Namespace:
-    """Return the command line, and in `arguments` what begins it again."""
+    """Return the parsed command line, and in `arguments` the command that repeats it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
-    making = commands.add_parser("artefacts", help="compile all modules")
-    making.add_argument("folder", type=Path)
-    making.set_defaults(call=lambda options: make_artefacts(options.folder))
+    compiling = commands.add_parser("artefacts", help="compile all modules")
+    compiling.add_argument("folder", type=Path)
+    compiling.set_defaults(call=lambda options: make_artefacts(options.folder))
     running = commands.add_parser("run", help="time them")
     running.add_argument("folder", type=Path)
-    running.add_argument("--out", type=Path, required=True, help="JSON file; rows of an earlier run are kept")
+    running.add_argument("--out", type=Path, required=True, help="JSON file, in which rows of earlier runs stay")
     running.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
     running.add_argument("--modules", nargs="+", choices=MODULES, default=list(MODULES))
-    running.add_argument("--envs", nargs="+", type=int, default=[1024, 4096, 8192, 16384], help="code is for the most")
+    running.add_argument("--envs", nargs="+", type=int, default=[1024, 4096, 8192, 16384], help="code is compiled for the most")
     running.add_argument("--device", default="cuda")
-    running.add_argument("--repeats", type=int, default=6, help="timed steps from each instant")
-    running.add_argument("--instants", type=int, default=4)
+    running.add_argument("--repeats", type=int, default=6, help="timed steps from each saved state")
     running.add_argument("--eager", action="store_true", help="neither compiled modules nor CUDA graphs")
-    running.add_argument("--native-ccd", action="store_true", help="boxes meet by MuJoCo Warp's own way, not by MuJoCo's")
     running.add_argument("--profile", action="store_true", help="list each module's kernels too")
     turns.add_options(running)
     running.set_defaults(call=run)
-    drawing = commands.add_parser("plot", help="draw what was measured")
+    drawing = commands.add_parser("plot", help="draw the results")
     drawing.add_argument("results", type=Path)
     drawing.add_argument("--out", type=Path, default=Path("docs/images/physics.png"))
     drawing.set_defaults(call=plot)
@@ -384,5 +377,5 @@ def parsed() -> argparse.Namespace:
 
 
 if __name__ == "__main__":
-    chosen = parsed()
-    chosen.call(chosen)
+    command = parsed()
+    command.call(command)

@@ -1,4 +1,4 @@
-"""What `physics.py` times: scenes, modules, and the artefacts that hold them."""
+"""Scenes and modules for `physics.py`, and their artefacts."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "elastomer": {"kind": "elastomer", "anchors": "points", "points": 500},
     "surface_distance": {"kind": "surface_distance"},
 }
-"""Every kind of sensor. Points are as many as in the paper's speed tests; the field errs as much as 5,000 of them."""
+"""Every kind of sensor. 500 points as in the paper's speed tests; the field is as accurate as 5,000 points."""
 FIVE = ("contact_depth", "contact", "kinematic_taxel", "proximity", "elastomer")
 """The paper's kinds."""
 CONTACT_KINDS = ("contact_depth", "contact", "kinematic_taxel", "force_taxel", "link_contact", "elastomer")
@@ -42,7 +42,7 @@ EVERY_KNOB: dict[str, Any] = {
     "crosstalk": {"strength": 0.3, "sigma": 3e-3},
     "radius_noise": 3e-4,
 }
-"""All knobs of noise; each sensor gets those that its kind has."""
+"""All knobs of noise; each kind takes those that it supports."""
 MODULES: dict[str, tuple[tuple[str, ...], Any]] = {
     **{name: ((name,), None) for name in KINDS},
     "five kinds": (FIVE, None),
@@ -51,14 +51,14 @@ MODULES: dict[str, tuple[tuple[str, ...], Any]] = {
     "five kinds, noisy": (FIVE, "noisy"),
     "contact kinds, every knob": (CONTACT_KINDS, EVERY_KNOB),
 }
-"""What is timed: its sensors, and their noise."""
+"""Sensors and noise of each module."""
 PLAIN = "surface_distance"
-"""The module that asks for no contacts: its simulator, stepped without reading, stands for none."""
+"""A module that needs no contacts: its simulator, stepped without reading, is the step without sensors."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A document, and how its environments are stepped."""
+    """A document, and the settings of its simulation."""
 
     document: str
     resolution: str
@@ -73,7 +73,7 @@ class Scene:
 
     @property
     def modules(self) -> list[str]:
-        """What is timed of it."""
+        """Modules to time on the scene."""
         return [name for name in MODULES if name not in self.left_out]
 
 
@@ -89,15 +89,15 @@ SCENES = {
 
 
 def artefact(folder: Path, scene: Scene, module: str) -> Path:
-    """Return the file of a module; scenes that differ in their cone share it."""
+    """Return the path of a module's artefact; scenes that differ only in the cone share it."""
     name = "".join(c if c.isalnum() else "_" for c in module)
     return folder / f"{scene.document.removesuffix('.yaml')}-{scene.resolution}-{name}.safetensors"
 
 
 def sensors(scene: Scene, module: str) -> dict[str, Any]:
-    """Return the sensors of a module, as a document has them."""
+    """Return the `sensors` of a module's document."""
     names, noise = MODULES[module]
-    found = {}
+    result = {}
     for i, name in enumerate(names):
         sensor = {**KINDS[name], "links": scene.links, "feels": list(scene.feels)}
         if isinstance(noise, dict):
@@ -105,12 +105,12 @@ def sensors(scene: Scene, module: str) -> dict[str, Any]:
             sensor["noise"] = {knob: value for knob, value in noise.items() if knob in kind.knobs - kind.idle_knobs}
         elif noise is not None:
             sensor["noise"] = noise
-        found[f"s{i}"] = sensor
-    return found
+        result[f"s{i}"] = sensor
+    return result
 
 
 def make_artefacts(folder: Path) -> None:
-    """Compile every module of every scene that is not there yet."""
+    """Compile every module of every scene that has no artefact yet."""
     folder.mkdir(parents=True, exist_ok=True)
     for scene in SCENES.values():
         for module in scene.modules:

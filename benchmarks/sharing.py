@@ -1,9 +1,9 @@
-"""One query for several sensors: what two kinds on the same probes cost together, and in modules of their own.
+"""Measure a query that two sensors share: the cost of two kinds on the same probes in one module, and in separate modules.
 
     python benchmarks/sharing.py [--device cuda] [--num-envs 512] [--repeats 20] [--compiled]
 
-The XHand1 at medium resolution (199 taxels) with a ball of triangles in its palm, felt by way of a baked grid; the sensors are
-`kinematic_taxel`, felt while in contact, and `contact_depth`, felt by reach alone. Medians of calls made in turn.
+The XHand1 at medium resolution (199 taxels) has a mesh ball on its palm, as a baked grid. `kinematic_taxel` is gated by
+contact, `contact_depth` by distance. Times are medians of alternating calls.
 """
 
 from __future__ import annotations
@@ -29,20 +29,18 @@ SENSORS = {
 
 @dataclass(frozen=True)
 class Options:
-    """What to time."""
+    """The command line."""
 
     device: str = "cpu"
-    """Where."""
     num_envs: int = 512
-    """Environments."""
     repeats: int = 20
     """Timed calls of each module."""
     compiled: bool = False
-    """Whether to fuse the modules with torch.compile first."""
+    """Whether to compile the modules."""
 
 
 def module(folder: Path, sensors: tuple[str, ...], device: str) -> TactileModule:
-    """Return a module with some of the sensors."""
+    """Return a module with the named sensors."""
     mesh = folder / "ball.stl"
     trimesh.creation.icosphere(subdivisions=4, radius=0.02).export(mesh)
     document = {

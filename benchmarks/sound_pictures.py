@@ -1,4 +1,4 @@
-"""Pictures of docs/background/sound.md: errors of a microphone's interpolation and Doppler shift, and the materials by ear.
+"""Draw the pictures of docs/background/sound.md: errors of a microphone's interpolation, Doppler shifts, and spectrograms.
 
 python benchmarks/sound_pictures.py [--out docs/images]
 """
@@ -21,23 +21,23 @@ SPEED, TONE, STEP, SAMPLES = 343.0, 3000.0, 1e-3, 20
 
 
 def interpolation_errors(frequency: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest errors of level [1] and delay [samples] over all fractions, at parts of the sample rate."""
+    """Return the largest errors of level [1] and delay [samples] over all fractions, by frequency / sample rate."""
     fraction, taps = np.linspace(0, 1, 101), np.arange(TAPS) - (TAPS // 2 - 1)
     powers = (fraction[:, None] - 0.5) ** np.arange(len(coefficients()))
     omega = 2 * np.pi * frequency
-    found = np.exp(1j * np.outer(omega, taps)) @ (powers @ coefficients()).T / np.exp(1j * np.outer(omega, fraction))
-    return np.abs(np.abs(found) - 1).max(axis=1), np.abs(np.angle(found) / omega[:, None]).max(axis=1)
+    response = np.exp(1j * np.outer(omega, taps)) @ (powers @ coefficients()).T / np.exp(1j * np.outer(omega, fraction))
+    return np.abs(np.abs(response) - 1).max(axis=1), np.abs(np.angle(response) / omega[:, None]).max(axis=1)
 
 
-def heard_frequency(speed: float, is_source: bool) -> float:
-    """Return at what frequency a tone is heard of a source, or by a microphone, that moves away [Hz]."""
+def shifted_frequency(speed: float, is_source: bool) -> float:
+    """Return the frequency at the microphone of a tone whose source, or else the microphone, moves away [Hz]."""
     ages = []
     for now in (0, 1):
         node = torch.arange(40, dtype=torch.float64)
         source = speed * STEP * (now - node) if is_source else torch.zeros(40, dtype=torch.float64)
         listener = -3.0 - (0.0 if is_source else speed * STEP * now)
-        away = (listener - source)[None, :, None]
-        age = age_of_sound((away, 0 * away, 0 * away), torch.tensor(SPEED * STEP, dtype=torch.float64))
+        distance = (listener - source)[None, :, None]
+        age = age_of_sound((distance, 0 * distance, 0 * distance), torch.tensor(SPEED * STEP, dtype=torch.float64))
         ages.append(float(age))
     return TONE * (1 - (ages[1] - ages[0]))
 
@@ -63,29 +63,32 @@ def draw_microphone(path: Path) -> None:
         (False, "microphone moves", TONE * (1 - speeds / SPEED)),
     ):
         (line,) = right.plot(speeds, shift - TONE, lw=1)
-        found = [heard_frequency(float(speed), is_source) - TONE for speed in speeds]
-        right.plot(speeds, found, "o", ms=3, color=line.get_color(), label=name)
+        measured = [shifted_frequency(float(speed), is_source) - TONE for speed in speeds]
+        right.plot(speeds, measured, "o", ms=3, color=line.get_color(), label=name)
     right.set(xlabel="speed away [m/s]", ylabel="f′ − f [Hz]")
     right.legend()
     figure.savefig(path)
 
 
 def draw_materials(path: Path) -> None:
-    """Draw the spectrograms of the example, with the modes of its boxes."""
+    """Draw the spectrograms of the example, and mark the modes of its boxes."""
     touch = tgdsl.compile(EXAMPLE)
     sim, controls = script_of(touch).begin(touch, 1, 1, 0.9)
-    own = sounding(touch.plan)
-    blocks: dict[str, list[np.ndarray]] = {sensor.name: [] for sensor in own}
+    sensors = sounding(touch.plan)
+    blocks: dict[str, list[np.ndarray]] = {sensor.name: [] for sensor in sensors}
     for step in rollout(touch, sim, controls):
-        for name, found in blocks.items():
-            found.append(step.readings[name][0, :, :, 0].sum(dim=1).numpy())
+        for name, signal in blocks.items():
+            signal.append(step.readings[name][0, :, :, 0].sum(dim=1).numpy())
     rate = len(blocks["ear"][0]) / sim.control_step
-    sounds = [Sound(sensor.name, sensor.readings[0].units[0], rate, np.concatenate(blocks[sensor.name])) for sensor in own]
-    draw(sounds, path, marks={sensor.name: sensor.constants["frequency"][0].tolist() for sensor in own if not sensor.upstream})
+    sounds = [Sound(sensor.name, sensor.readings[0].units[0], rate, np.concatenate(blocks[sensor.name])) for sensor in sensors]
+    draw(
+        sounds,
+        path,
+        marks={sensor.name: sensor.constants["frequency"][0].tolist() for sensor in sensors if not sensor.upstream},
+    )
 
 
 def main() -> None:
-    """Draw all."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("docs/images"))
     out = parser.parse_args().out

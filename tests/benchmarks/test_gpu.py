@@ -91,7 +91,7 @@ class TestLimits:
         assert unmet(ROW, None) == [] and judged(ROW, None) == "yes"
 
     @pytest.mark.parametrize(
-        ("changes", "said"),
+        ("changes", "reason"),
         [
             ({"graph": 0.031}, "graph 0.031 ms > 0.03 ms"),
             ({"replayed": 0.09}, "from Python 0.09 ms > 0.08 ms"),
@@ -100,9 +100,9 @@ class TestLimits:
             ({"error": 2e-5}, "error 2.0e-05 > 1e-05"),
         ],
     )
-    def test_missed_limits_are_named(self, changes, said):
+    def test_missed_limits_are_named(self, changes, reason):
         row = replace(ROW, **changes)
-        assert unmet(row, None) == [said] and judged(row, None) == f"no: {said}"
+        assert unmet(row, None) == [reason] and judged(row, None) == f"no: {reason}"
 
     def test_the_rival_must_take_six_times_longer(self):
         row = replace(ROW, case="kinematic-10-objects", graph=0.41 / 5)
@@ -170,12 +170,12 @@ class TestGuard:
 
     def test_faster_rows_and_new_ones_pass(self):
         lines, is_met = gpu.compared({"depth × 16,384": 2.0, "new × 8": 1.0}, {"depth × 16,384": 3.0})
-        assert is_met and "-33%" in lines[0] and "nothing kept" in lines[1]
+        assert is_met and "-33%" in lines[0] and "not recorded" in lines[1]
 
-    def test_a_card_without_kept_ratios_does_not_pass(self):
+    def test_a_card_without_recorded_ratios_does_not_pass(self):
         assert not gpu.compared({"depth × 16,384": 2.0}, {})[1]
 
-    def test_a_dry_run_keeps_ratios_and_compares_them(self, tmp_path, capsys, monkeypatch):
+    def test_a_dry_run_records_ratios_and_compares_them(self, tmp_path, capsys, monkeypatch):
         make_artefacts(tmp_path / "art", [CASES["depth"]])
         file = tmp_path / "kept.json"
         files = ["--out", str(tmp_path / "rows.json"), "--kept", str(file)]

@@ -28,8 +28,8 @@ def options(tmp_path):
 
 
 def test_all_parts_are_measured_and_written(options, tmp_path, capsys):
-    students.main([*options, "--envs", "24", "--out", str(tmp_path / "found.json")])
-    report = json.loads((tmp_path / "found.json").read_text())
+    students.main([*options, "--envs", "24", "--out", str(tmp_path / "report.json")])
+    report = json.loads((tmp_path / "report.json").read_text())
     parts = report["parts"]
     assert {name: (part["students"], part["stacks"]) for name, part in parts.items()} == {
         "one": (1, 1),
@@ -41,15 +41,9 @@ def test_all_parts_are_measured_and_written(options, tmp_path, capsys):
         assert part["rollout_ms"] > 0 and part["update_ms"] > 0
         assert part["ratio"] == pytest.approx(part["iteration_ms"] / parts["one"]["iteration_ms"], abs=1e-3)
         assert part["iteration_spread_ms"][0] <= part["iteration_ms"] <= part["iteration_spread_ms"][1]
-    assert report["envs"] == 24 and report["steps"] == 4 and not report["once"]
+    assert report["envs"] == 24 and report["steps"] == 4
     text = capsys.readouterr().out
     assert "seeds | 3 | 1 |" in text and "| 1.20" in text and "| 1.40" in text
-
-
-def test_environments_made_once(options, tmp_path, capsys):
-    students.main([*options, "--envs", "24", "--once", "--types", "bool", "depth", "--out", str(tmp_path / "found.json")])
-    assert list(json.loads((tmp_path / "found.json").read_text())["parts"]) == ["one", "seeds", "types"]
-    assert capsys.readouterr().out.count("environments for") == 1
 
 
 def test_wrong_arguments_are_refused(options, capsys):
