@@ -203,17 +203,35 @@ POINT = {"pos": [0, 0, 0], "normal": [0, 0, 1], "radius": R}
 def test_variants_equal_single_objects(tmp_path, backend):
     variants = [{"type": "box", "size": [0.02] * 3}, {"type": "sphere", "size": [0.02]}]
     options = {"backend": backend} | ({"points": 500} if backend == "points" else {})
-    touch = tgdsl.compile(document(tmp_path, [POINT], target={"variants": variants}, **options), dtype=torch.float64)
+    points = [POINT, {**POINT, "radius": 0.8 * R}]
+    touch = tgdsl.compile(document(tmp_path, points, target={"variants": variants}, **options), dtype=torch.float64)
     at = touch.example_state(4, spread=0.004)
     assert at.body_pos is not None and at.variant is not None
     at.body_pos[:, touch.inputs.bodies.index("item"), 2] -= 0.024
     together = touch(at)["s"]
     for env in range(4):
         target = {"geom": variants[int(at.variant[env, 0])]}
-        alone = tgdsl.compile(document(tmp_path, [POINT], target=target, **options), dtype=torch.float64)
+        alone = tgdsl.compile(document(tmp_path, points, target=target, **options), dtype=torch.float64)
         values = {name: getattr(at, name)[env : env + 1] for name in alone.inputs.fields}
         torch.testing.assert_close(alone(SceneState(**values))["s"][0], together[env], rtol=1e-12, atol=1e-15)
     assert (together[:, 0, :3].abs().sum(dim=1) > 0).sum() >= 3
+
+
+def test_a_body_feels_like_the_sum_of_its_geoms(tmp_path):
+    """A box and two planes, at rest; planes hide nothing of each other or of the box."""
+    plane = '<geom type="plane" size="1 1 .1"/>'
+    geoms = ['<geom type="box" size=".02 .02 .002"/>', plane, plane.replace("/>", ' pos="0 0 -.002" euler="10 0 0"/>')]
+    readings = []
+    for chosen in (geoms, *([geom] for geom in geoms)):
+        spec = document(tmp_path, [POINT], feels=["floor"], reference_area=AREA)
+        (tmp_path / "scene.xml").write_text(SCENE.replace(plane, "".join(chosen)))
+        touch = tgdsl.compile(spec, dtype=torch.float64)
+        above = state(touch)
+        above.body_pos[0, touch.inputs.bodies.index("pad"), 2] = 0.004
+        readings.append(touch(above)["s"][0, 0])
+    whole, *parts = readings
+    torch.testing.assert_close(whole, torch.stack(parts).sum(dim=0), rtol=1e-9, atol=1e-15)
+    assert all(part[2] < 0 for part in parts)
 
 
 @pytest.mark.parametrize(
