@@ -71,7 +71,7 @@ class GatesSpec(SpecModel):
     taxels: Whole
     """Number of gates that may stay open."""
     weight: NonNegative = 1.0
-    """Loss of each further gate, times the number of taxels."""
+    """Loss of each further gate, times the number of taxels; 1 suits errors of actions of about 1, see `normalise`."""
 
 
 class DistillSpec(SpecModel):
