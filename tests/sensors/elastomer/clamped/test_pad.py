@@ -13,6 +13,7 @@ from pads import MM
 from scipy.spatial.transform import Rotation
 
 from tgdsl.errors import LowerError
+from tgdsl.sensors.elastomer.clamped import pad as pad_module
 from tgdsl.sensors.elastomer.clamped.pad import Pad, unroll
 from tgdsl.surfaces.surface import Surface
 
@@ -76,6 +77,19 @@ def test_a_plate_stays_itself_whatever_its_triangles(surface):
     np.testing.assert_allclose(area(pad), 500 * MM**2, rtol=EXACT)
     assert angles(pad).min() > 25
     assert len(rim) == 2 * 90  # a corner each millimetre, and a middle between
+
+
+@pytest.mark.parametrize("start", [0, 5, 40])
+def test_an_edge_has_its_corners_and_even_pieces_wherever_its_loop_begins(start):
+    """A rectangle of 4.5 by 2 elements with a vertex each quarter: five pieces of 0.9 and two of 1 to a side."""
+    x, y = np.arange(0, 4.5, 0.25), np.arange(0, 2, 0.25)
+    sides = [(x, 0 * x), (0 * y + 4.5, y), (4.5 - x, 0 * x + 2), (0 * y, 2 - y)]
+    loop = np.roll(np.concatenate([np.stack(side, axis=1) for side in sides]), start, axis=0)
+    points = pad_module._sampled(loop)
+    expected = {(0.9 * i, 2.0 * j) for i in range(6) for j in range(2)} | {(0.0, 1.0), (4.5, 1.0)}
+    assert {tuple(point) for point in np.round(points, 9).tolist()} == {
+        tuple(np.round(point, 9).tolist()) for point in expected
+    }
 
 
 def test_a_face_of_a_box_in_any_pose():
