@@ -1,25 +1,24 @@
-"""Elastomer: error and time of the ways to apply its fixed operator, and what a planar convolution does to a curved fingertip.
+"""Compare ways to apply the elastomer's fixed operator: error and time on flat pads, and a planar convolution on fingertips.
 
     python benchmarks/elastomer.py forms [--device cuda] [--num-envs 4096] [--out docs]
     python benchmarks/elastomer.py curved
     python benchmarks/elastomer.py cycle [--out docs/images]
 
-`forms` presses random spheres into square pads of n × n markers (the paper's Gaussian, with shear), in every form that such a
-pad can have: dense, fft, truncated svd, and dense with a clamped boundary. The error is that of the float32 form against the
-dense matrix in float64 (which the tests compare with the definition), over the largest displacement in the batch; of the
-clamped one, against its own float64. Times are medians of compiled calls, on a GPU of replayed CUDA graphs.
+`forms` presses random spheres into square pads of n × n markers (the paper's Gaussian, with shear), for every form that the
+operator of such a pad supports. The error of a float32 form is against the dense matrix in float64 (which the tests compare
+with the definition; forms with a clamped boundary: their own), relative to the largest displacement in the batch. Times are
+medians of compiled calls, on a GPU of replayed CUDA graphs.
 
-`curved` compares the dense operator on the XHand1's and the Sharpa's fingertips with the operator of a regular grid in the mean
-plane of the same taxels, the one that a planar FFT computes: displacements in the links' frames, over the largest one.
+`curved` compares the dense operator on fingertips of the XHand1 and the Sharpa Wave with the operator of a planar FFT: a
+regular grid in the mean plane of the same taxels. Errors are of displacements in the links' frames, relative to the largest.
 
-`cycle` presses a ball of 20 mm radius 1 mm deep into 121 × 121 taxels, moves it to and fro, and prints the friction force that
-the anchors carry beside the closed forms of a Winkler foundation and of an elastic half-space (Cattaneo, Mindlin).
+`cycle` presses a ball of 20 mm radius 1 mm deep into 121 × 121 taxels and moves it back and forth. It compares the friction
+force on the anchors with the closed forms of a Winkler foundation and of an elastic half-space (Cattaneo, Mindlin).
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,6 +26,7 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 import tyro
+from gpu import captured
 from module import median_ms
 from torch import Tensor
 
@@ -40,7 +40,7 @@ from tgdsl.surfaces.surface import Surface
 PITCH = 1.5e-3
 """Spacing of the markers of the square pads [m]."""
 EDGE = 1.5e-3
-"""How far the pad goes on beyond the outermost markers [m]."""
+"""Width of the pad beyond the outermost markers [m]."""
 FORMS: dict[str, dict[str, Any]] = {
     "dense": {"operator": "dense"},
     "fft": {"operator": "fft"},
@@ -69,7 +69,7 @@ def square(num: int) -> tuple[LinkTaxels, Surface]:
 
 
 def presses(taxels: LinkTaxels, num_envs: int, seed: int = 0) -> dict[str, Tensor]:
-    """Return what goes into each operator when spheres press into a pad and drag it: float64 planes (…, env, taxel)."""
+    """Return the inputs of each operator for spheres that press into a pad and drag it: float64 planes (…, env, taxel)."""
     rng = np.random.default_rng(seed)
     extent = np.abs(taxels.pos[:, :2]).max()
     centre = rng.uniform(-extent, extent, (num_envs, 1, 2))
@@ -95,7 +95,7 @@ def folded(taxels: LinkTaxels, surface: Surface, fields: dict[str, Any]) -> dict
 
 
 def displacement(link: Operators, inputs: dict[str, Tensor]) -> Tensor:
-    """Return the displacement planes (3, env, taxel) on a flat pad that looks along z, strengths 1."""
+    """Return the displacement planes (3, env, taxel) on a flat pad with normals along z and strengths of 1."""
     x, y, z = operators.apply([link["spread"]], [inputs["spread"]])
     (bulge,) = operators.apply([link["bulge"]], [inputs["bulge"]])
     (drag,) = operators.apply([link["drag"]], [inputs["drag"]])
@@ -107,9 +107,7 @@ class Forms:
     """Error and time of every form."""
 
     device: str = "cpu"
-    """Where."""
     num_envs: int = 1024
-    """Environments."""
     sizes: tuple[int, ...] = (10, 20, 32)
     """Markers along each side."""
     repeats: int = 20
@@ -131,29 +129,30 @@ class Forms:
         taxels, surface = square(num)
         exact = {name: value.to(self.device) for name, value in presses(taxels, self.num_envs).items()}
         inputs = {name: value.float() for name, value in exact.items()}
-        calls, errors, bytes_of = {}, {}, {}
+        calls, errors, sizes = {}, {}, {}
         for form, fields in FORMS.items():
             arrays = folded(taxels, surface, fields)
             dense = folded(taxels, surface, {**fields, "operator": "dense", "tolerance": None} if "svd" in form else fields)
-            truth = displacement(on(dense, self.device, torch.float64), exact)
-            link = on(arrays, self.device, torch.float32)
+            truth = displacement(tensors(dense, self.device, torch.float64), exact)
+            link = tensors(arrays, self.device, torch.float32)
             result = displacement(link, inputs)
             errors[form] = float((result.double() - truth).abs().max() / truth.abs().max())
-            bytes_of[form] = sum(value.size for operator in arrays.values() for value in vars(operator).values())
+            sizes[form] = sum(value.size for operator in arrays.values() for value in vars(operator).values())
             torch.compiler.reset()
             compiled = torch.compile(displacement, fullgraph=True, dynamic=False) if form != "fft" else displacement
-            calls[form] = captured(lambda c=link, f=compiled: f(c, inputs), self.device)
+            with torch.no_grad():
+                calls[form] = captured(lambda c=link, f=compiled: f(c, inputs), torch.device(self.device))
         times = median_ms(calls, self.repeats, self.device)
         rows = []
         for form in FORMS:
             cost = 1e3 * times[form] if self.device == "cuda" else times[form] / times["dense"]
-            print(f"| {num} × {num} | {form} | {bytes_of[form]} | {errors[form]:.1e} | {cost:.3g} |", flush=True)
+            print(f"| {num} × {num} | {form} | {sizes[form]} | {errors[form]:.1e} | {cost:.3g} |", flush=True)
             rows.append((num, form, errors[form], cost))
         return rows
 
 
-def on(link: dict[str, Operator[np.ndarray]], device: str, dtype: torch.dtype) -> Operators:
-    """Return operators of tensors; floats in `dtype`."""
+def tensors(link: dict[str, Operator[np.ndarray]], device: str, dtype: torch.dtype) -> Operators:
+    """Return operators with tensors on a device; floats have the dtype."""
 
     def tensor(value: np.ndarray) -> Tensor:
         result = torch.from_numpy(np.ascontiguousarray(value)).to(device)
@@ -163,25 +162,6 @@ def on(link: dict[str, Operator[np.ndarray]], device: str, dtype: torch.dtype) -
         name: operators.operator_of({key: tensor(value) for key, value in vars(operator).items()})
         for name, operator in link.items()
     }
-
-
-def captured(call: Callable[[], Any], device: str) -> Callable[[], Any]:
-    """Return a call that replays a CUDA graph of another; on a CPU the call itself."""
-    if device != "cuda":
-        return call
-    stream = torch.cuda.Stream()
-    with torch.cuda.stream(stream), torch.no_grad():
-        for _ in range(3):
-            call()
-    torch.cuda.synchronize()
-    graph = torch.cuda.CUDAGraph()
-    with torch.no_grad(), torch.cuda.graph(graph):
-        call()
-
-    def replay(_inputs: Callable[[], Any] = call) -> None:  # the graph reads their memory, so they must live as long
-        graph.replay()
-
-    return replay
 
 
 def plot(rows: list[tuple[int, str, float, float]], device: str, unit: str, path: Path) -> None:
@@ -209,7 +189,7 @@ class Curved:
     """Resolutions of the hands' layouts."""
 
     def run(self) -> None:
-        """Print one row per fingertip: how curved it is, and the largest and RMS error, of the dense operator and planar."""
+        """Print a row per fingertip: its curvature, the error of the dense operator, and largest and RMS planar errors."""
         from tgdsl.compiler.pipeline import placed
 
         print("| hand | fingertip | taxels | normals differ by | dense | planar, largest | planar, RMS |")
@@ -220,21 +200,25 @@ class Curved:
             ).layouts.items():
                 links = [i for i, link in enumerate(layout.links) if link.name in layout.groups["tips"]]
                 for i in links[:2]:
-                    own = layout.link_id == i
+                    on_link = layout.link_id == i
                     taxels = LinkTaxels(
-                        layout.pos[own], layout.normal[own], layout.area[own], layout.cell[own], layout.radius[own] > 0
+                        layout.pos[on_link],
+                        layout.normal[on_link],
+                        layout.area[on_link],
+                        layout.cell[on_link],
+                        layout.radius[on_link] > 0,
                     )
                     if (taxels.cell < 0).any():
                         continue
                     angle = np.degrees(np.arccos(np.clip(taxels.normal @ taxels.normal.mean(axis=0), -1, 1)))
                     exact, flat = responses_of(taxels), responses_of(flattened(taxels))
                     h = bumps(taxels)
-                    true, seen = (np.einsum("kji,ei->ekj", matrix, h) for matrix in (exact, flat))
-                    error, scale = np.linalg.norm(seen - true, axis=1), np.linalg.norm(true, axis=1).max()
-                    dense = np.linalg.norm(in_float32(taxels, h) - true, axis=1).max() / scale
-                    name = f"{hand}, {resolution} | {layout.links[i].name} | {own.sum()} | {angle.max():.0f}°"
-                    planar = f"{100 * error.max() / scale:.0f} % | {100 * np.sqrt((error**2).mean()) / scale:.1f} %"
-                    print(f"| {name} | {dense:.0e} | {planar} |")
+                    expected, planar = (np.einsum("kji,ei->ekj", matrix, h) for matrix in (exact, flat))
+                    error, scale = np.linalg.norm(planar - expected, axis=1), np.linalg.norm(expected, axis=1).max()
+                    dense = np.linalg.norm(in_float32(taxels, h) - expected, axis=1).max() / scale
+                    name = f"{hand}, {resolution} | {layout.links[i].name} | {on_link.sum()} | {angle.max():.0f}°"
+                    errors = f"{100 * error.max() / scale:.0f} % | {100 * np.sqrt((error**2).mean()) / scale:.1f} %"
+                    print(f"| {name} | {dense:.0e} | {errors} |")
 
 
 def responses_of(taxels: LinkTaxels) -> np.ndarray:
@@ -243,15 +227,15 @@ def responses_of(taxels: LinkTaxels) -> np.ndarray:
 
 
 def in_float32(taxels: LinkTaxels, h: np.ndarray) -> np.ndarray:
-    """Return what a module's dense operator makes of depths (press, taxel), in float32."""
+    """Return the displacements by a module's dense operator for depths (press, taxel), in float32."""
     response = operators.responses(spec_of(), taxels, None)["spread"]
     spread = operators.fold(response, operators.PLANES["spread"], taxels, OperatorForm("dense", None))
-    link = on({"spread": spread}, "cpu", torch.float32)
+    link = tensors({"spread": spread}, "cpu", torch.float32)
     return torch.stack(operators.apply([link["spread"]], [torch.from_numpy(h).float()]), dim=1).double().numpy()
 
 
 def flattened(taxels: LinkTaxels) -> LinkTaxels:
-    """Return the taxels as a regular grid in their mean plane, with one normal: what a planar FFT takes them for."""
+    """Return the taxels as a regular grid in their mean plane, with one normal, as a planar FFT assumes."""
     normal = taxels.normal.mean(axis=0)
     normal /= np.linalg.norm(normal)
     design = np.column_stack([taxels.cell, np.ones(len(taxels.cell))])
@@ -264,10 +248,10 @@ def flattened(taxels: LinkTaxels) -> LinkTaxels:
 
 
 def bumps(taxels: LinkTaxels, num: int = 200) -> np.ndarray:
-    """Return depths (press, taxel) under balls of 5 mm that press 1 mm deep over random taxels [m]."""
-    chosen = np.random.default_rng(0).integers(len(taxels.pos), size=num)
-    apart = np.linalg.norm(taxels.pos[None] - taxels.pos[chosen][:, None], axis=2)
-    return np.maximum(0.0, 1e-3 - apart**2 / (2 * 5e-3))
+    """Return depths (press, taxel) under balls of 5 mm that press 1 mm deep at random taxels [m]."""
+    centres = np.random.default_rng(0).integers(len(taxels.pos), size=num)
+    distance = np.linalg.norm(taxels.pos[None] - taxels.pos[centres][:, None], axis=2)
+    return np.maximum(0.0, 1e-3 - distance**2 / (2 * 5e-3))
 
 
 @dataclass(frozen=True)
@@ -278,56 +262,57 @@ class Cycle:
     """Folder for the plot."""
 
     def run(self) -> None:
-        """Move a ball in a pad and compare."""
+        """Move a ball in a pad and compare the friction force with closed forms."""
         radius, depth, slip = 0.02, 1e-3, 0.4
         line = np.linspace(-7e-3, 7e-3, 121)
         x, y = (part.reshape(-1) for part in np.meshgrid(line, line))
         pos, normal = np.stack([x, y, 0 * x], axis=1), np.broadcast_to([0.0, 0.0, 1.0], (x.size, 3))
         h = depth - (x * x + y * y) / (2 * radius)
         stick_slip, state = StickSlip(0.0, 0.0, 1e-2, slip), {name: np.zeros(x.size) for name in PLANES}
-        way = np.concatenate([np.linspace(0, 0.8, 33), np.linspace(0.8, -0.8, 65)[1:], np.linspace(-0.8, 0.8, 65)[1:]])
-        found = []
-        for s in way * slip * depth:
-            moved = np.broadcast_to([-s, 0.0, 0.0], (x.size, 1, 3))
+        path = np.concatenate([np.linspace(0, 0.8, 33), np.linspace(0.8, -0.8, 65)[1:], np.linspace(-0.8, 0.8, 65)[1:]])
+        series = []
+        for s in path * slip * depth:
+            offset = np.broadcast_to([-s, 0.0, 0.0], (x.size, 1, 3))
             touch = ReferencePenetration(
                 np.maximum(h, 0), 0 * pos, 0 * pos, 0 * pos, -h[:, None], 0 * pos[:, None],
-                np.broadcast_to(np.eye(3), (x.size, 1, 3, 3)), moved,
+                np.broadcast_to(np.eye(3), (x.size, 1, 3, 3)), offset,
             )  # fmt: skip
-            carried, state = advance_reference(touch, pos, normal, stick_slip, state)
-            found.append(carried[:, 0].sum() / (slip * np.maximum(h, 0).sum()))
-        closed = {name: loop(way, power) for name, power in {"Winkler": 2.0, "Mindlin": 1.5}.items()}
+            stretch, state = advance_reference(touch, pos, normal, stick_slip, state)
+            series.append(stretch[:, 0].sum() / (slip * np.maximum(h, 0).sum()))
+        force = np.array(series)
+        closed = {name: loop(path, power) for name, power in {"Winkler": 2.0, "Mindlin": 1.5}.items()}
         print("| s/s* | anchors Q/μP | Winkler 1 − (1 − s/s*)² | Cattaneo–Mindlin 1 − (1 − s/s*)^1.5 |\n|---|---|---|---|")
         for i in (*range(0, 33, 8), 64, 96, 128, 160):
-            print(f"| {way[i]:.2f} | {found[i]:.3f} | {closed['Winkler'][i]:.3f} | {closed['Mindlin'][i]:.3f} |")
-        apart = {name: np.abs(np.array(found) - values).max() for name, values in closed.items()}
-        print(f"\nlargest difference: Winkler {apart['Winkler']:.4f}, Cattaneo–Mindlin {apart['Mindlin']:.4f}")
+            print(f"| {path[i]:.2f} | {force[i]:.3f} | {closed['Winkler'][i]:.3f} | {closed['Mindlin'][i]:.3f} |")
+        errors = {name: np.abs(force - values).max() for name, values in closed.items()}
+        print(f"\nlargest difference: Winkler {errors['Winkler']:.4f}, Cattaneo–Mindlin {errors['Mindlin']:.4f}")
         if self.out is not None:
-            plot_cycle(way, np.array(found), closed, self.out / "elastomer-cycle.png")
+            plot_cycle(path, force, closed, self.out / "elastomer-cycle.png")
 
 
-def loop(way: np.ndarray, power: float) -> np.ndarray:
+def loop(path: np.ndarray, power: float) -> np.ndarray:
     """Return Q/μP of a loading to 0.8 s*, back to −0.8 s* and forth: 1 − (1 − s)^n, then by Masing's rule."""
 
     def first(s: np.ndarray | float) -> Any:
         return 1 - (1 - np.asarray(s)) ** power
 
-    back, forth = first(0.8) - 2 * first((0.8 - way) / 2), -first(0.8) + 2 * first((0.8 + way) / 2)
-    return np.concatenate([first(way[:33]), back[33:97], forth[97:]])
+    back, forth = first(0.8) - 2 * first((0.8 - path) / 2), -first(0.8) + 2 * first((0.8 + path) / 2)
+    return np.concatenate([first(path[:33]), back[33:97], forth[97:]])
 
 
-def plot_cycle(way: np.ndarray, found: np.ndarray, closed: dict[str, np.ndarray], path: Path) -> None:
+def plot_cycle(path: np.ndarray, force: np.ndarray, closed: dict[str, np.ndarray], file: Path) -> None:
     """Draw the loops."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.2, 4.4), layout="constrained")
     axes = figure.subplots()
-    axes.plot(way, closed["Mindlin"], color="#b5542c", label="elastic half-space (Cattaneo, Mindlin)")
-    axes.plot(way, closed["Winkler"], color="#3b6fb6", label="Winkler foundation")
-    axes.plot(way[::4], found[::4], "o", markersize=3.5, color="#2b2f36", label="anchors on 121 × 121 taxels")
+    axes.plot(path, closed["Mindlin"], color="#b5542c", label="elastic half-space (Cattaneo, Mindlin)")
+    axes.plot(path, closed["Winkler"], color="#3b6fb6", label="Winkler foundation")
+    axes.plot(path[::4], force[::4], "o", markersize=3.5, color="#2b2f36", label="anchors on 121 × 121 taxels")
     axes.set(xlabel="displacement s/s*", ylabel="friction force Q/μP")
     axes.grid(alpha=0.25)
     axes.legend(frameon=False)
-    figure.savefig(path, dpi=110)
+    figure.savefig(file, dpi=110)
 
 
 Command = Annotated[Forms, tyro.conf.subcommand("forms")] | Annotated[Curved, tyro.conf.subcommand("curved")]

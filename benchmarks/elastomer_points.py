@@ -1,10 +1,10 @@
-"""Elastomer with `anchors: points` on a CPU: time with the points that do not pull left out, and with all of them summed.
+"""Time an elastomer with `anchors: points` on a CPU: with a sum over all points, and over those that pull alone.
 
     python benchmarks/elastomer_points.py [--num-envs 1024] [--threads 1] [--repeats 20]
 
 500 points of a 4 cm cube over 100 taxels, shear alone: the cube at rest on the pad, off it, and with all points in contact.
-Times are medians of compiled calls of both in turn, in time of the processor, which other work on the machine disturbs less.
-The difference is the largest of two readings over the largest reading.
+Times are medians of alternating compiled calls, in CPU time, which other processes disturb less. The difference is the largest
+of two readings relative to the largest reading.
 """
 
 from __future__ import annotations
@@ -29,20 +29,18 @@ from tgdsl.sensors.elastomer import point_anchors
 
 @dataclass(frozen=True)
 class Options:
-    """Time of anchors on points, with and without those that do not pull."""
+    """The command line."""
 
     num_envs: int = 1024
-    """Environments."""
     threads: int = 1
-    """Of the processor."""
     repeats: int = 20
-    """Timed calls of each."""
+    """Timed calls of each sum."""
 
     def run(self) -> None:
         """Measure and print one row per scene."""
         torch.set_num_threads(self.threads)
-        where = f"{torch.backends.cpu.get_cpu_capability()}, {self.threads} threads"
-        print(f"torch {torch.__version__}, {where}, {self.num_envs} environments, float32\n")
+        machine = f"{torch.backends.cpu.get_cpu_capability()}, {self.threads} threads"
+        print(f"torch {torch.__version__}, {machine}, {self.num_envs} environments, float32\n")
         print(
             "| cube | points that pull | all summed, ms | those that pull, ms | ratio | difference |\n|---|---|---|---|---|---|"
         )
@@ -50,13 +48,13 @@ class Options:
             self._scene(name, height, standoff)
 
     def _scene(self, name: str, height: float, standoff: float) -> None:
-        found, modules, times = {}, {}, {True: [], False: []}
+        readings, modules, times = {}, {}, {True: [], False: []}
         for is_compacted in times:
             touch = pad_of_points(standoff).compile()
             with summing(is_compacted), torch.no_grad():
                 for shift in (0.0, 1e-4):
                     state = on_pad(touch, self.num_envs, height, shift)
-                    found[is_compacted] = touch(state)["skin"].clone()
+                    readings[is_compacted] = touch(state)["skin"].clone()
             modules[is_compacted] = touch, state
         for _ in range(self.repeats):
             for is_compacted, (touch, state) in modules.items():
@@ -64,25 +62,26 @@ class Options:
                     start = time.process_time()
                     touch(state)
                     times[is_compacted].append(1e3 * (time.process_time() - start))
-        new, old = (float(np.median(times[is_compacted])) for is_compacted in (True, False))
-        apart = float((found[True] - found[False]).abs().max() / found[False].abs().max().clamp(min=1e-30))
+        compacted, whole = (float(np.median(times[is_compacted])) for is_compacted in (True, False))
+        difference = float((readings[True] - readings[False]).abs().max() / readings[False].abs().max().clamp(min=1e-30))
         held = float(modules[True][0].memory.get_buffer("skin:held").sum(dim=1).mean())
-        print(f"| {name} | {held:.0f} of 500 | {old:.1f} | {new:.1f} | {new / old:.2f} | {apart:.0e} |", flush=True)
+        times_text = f"{whole:.1f} | {compacted:.1f} | {compacted / whole:.2f}"
+        print(f"| {name} | {held:.0f} of 500 | {times_text} | {difference:.0e} |", flush=True)
 
 
 SCENES = {"at rest": (0.0245, 0.0), "off the pad": (0.05, 0.0), "all in contact": (0.0245, 0.2)}
-"""Height of the cube's middle above the pad's [m], and the skin's."""
+"""Height of the cube's centre above the pad's [m], and the skin's standoff [m]."""
 
 
 @contextmanager
 def summing(is_compacted: bool) -> Iterator[None]:
-    """Have modules that are compiled and called meanwhile leave out the points that do not pull, or sum over all."""
-    own = point_anchors.are_compacted
-    point_anchors.are_compacted = own if is_compacted else lambda *_: False
+    """Make modules that are compiled and called meanwhile sum over the points that pull, or over all."""
+    original = point_anchors.are_compacted
+    point_anchors.are_compacted = original if is_compacted else lambda *_: False
     try:
         yield
     finally:
-        point_anchors.are_compacted = own
+        point_anchors.are_compacted = original
 
 
 def pad_of_points(standoff: float) -> TactileModule:
@@ -102,7 +101,7 @@ def pad_of_points(standoff: float) -> TactileModule:
 
 
 def on_pad(touch: TactileModule, num_envs: int, height: float, shift: float) -> SceneState:
-    """Return states in which the cube is somewhere over the pad's middle, level, and moved on by a random shift [m]."""
+    """Return states with the cube level, near the pad's centre, and displaced by a random shift [m]."""
     random = torch.Generator().manual_seed(0)
     state = touch.example_state(num_envs, dtype=torch.float32)
     assert state.body_pos is not None and state.body_quat is not None

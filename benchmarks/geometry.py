@@ -1,12 +1,11 @@
-"""Distance queries: error against time per probe and bytes, for primitives and meshes.
+"""Measure distance queries of primitives and meshes: error, time per probe and bytes.
 
     python benchmarks/geometry.py prepare shapes.npz      # surfaces, grids and true distances, on a CPU
     python benchmarks/geometry.py measure shapes.npz --device cuda --out docs
 
-The truth is libigl's exact distance to the mesh in float64. A primitive's mesh is as fine as is practical: how far it is
-from the primitive shows in the row "analytic". Points are uniform in a band of 5 mm about the surface, held back from every
-choice of a grid. Error is that of the distance and of the gradient's direction; time is that of one compiled call on 2^18
-points (raycast: as it is), the median of several, per point.
+The truth is libigl's exact distance to the mesh in float64. The row "analytic" shows how far a primitive is from its mesh.
+Points are uniform in a band of 5 mm around the surface; no grid was chosen by them. Errors are of the distance and of the
+gradient's direction. The time per point is the median of compiled calls (raycast: eager) on 2^18 points.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -37,7 +36,7 @@ PRIMITIVES = {"box": (0.02, 0.015, 0.03), "cylinder": (0.015, 0.03, 0.0), "ellip
 
 @dataclass(frozen=True)
 class Prepare:
-    """Make the shapes, bake the grids and find the true distances."""
+    """Create the shapes, bake the grids and compute the true distances."""
 
     file: tyro.conf.Positional[Path]
     """The .npz file to write."""
@@ -57,22 +56,22 @@ class Prepare:
             squared, _, nearest_point = igl.point_mesh_squared_distance(points, vertices, faces)[:3]
             winding = np.asarray(igl.winding_number(vertices, faces, points)).reshape(-1)
             distance = np.where(winding > 0.5, -1.0, 1.0) * np.sqrt(squared)
-            away = points - nearest_point
+            offset = points - nearest_point
             keep = (np.abs(distance) <= MARGIN) & (np.abs(distance) > 1e-7)
             arrays |= {f"{name}/points": points[keep], f"{name}/distance": distance[keep]}
-            arrays[f"{name}/normal"] = (away / distance[:, None])[keep]
+            arrays[f"{name}/normal"] = (offset / distance[:, None])[keep]
             arrays |= {f"{name}/vertices": vertices, f"{name}/faces": faces}
             for tolerance in TOLERANCES:
                 start = time.perf_counter()
                 baked = bake(surface, MARGIN, tolerance)
-                about = {**dataclasses.asdict(baked.errors), "method": baked.method, "cell": baked.cell}
-                took = time.perf_counter() - start
-                print(f"{name}: {tolerance * 1e3:g} mm → {baked.method}, {baked.values.nbytes} bytes, {took:.1f} s")
+                metadata = {**dataclasses.asdict(baked.errors), "method": baked.method, "cell": baked.cell}
+                seconds = time.perf_counter() - start
+                print(f"{name}: {tolerance * 1e3:g} mm → {baked.method}, {baked.values.nbytes} bytes, {seconds:.1f} s")
                 key = f"{name}/{tolerance:g}"
                 arrays |= {
                     f"{key}/values": baked.values,
                     f"{key}/origin": baked.origin,
-                    f"{key}/about": np.array(json.dumps(about)),
+                    f"{key}/about": np.array(json.dumps(metadata)),
                 }
         np.savez_compressed(self.file, **arrays)  # type: ignore[arg-type]
 
@@ -99,10 +98,10 @@ def meshes() -> dict[str, Any]:
 
 
 def band(surface: Any, rng: np.random.Generator) -> np.ndarray:
-    """Return points spread over the band about a surface."""
-    chosen = rng.choice(len(surface.faces), NUM_ERROR, p=surface.face_areas / surface.face_areas.sum())
+    """Return random points in the band around a surface."""
+    faces = rng.choice(len(surface.faces), NUM_ERROR, p=surface.face_areas / surface.face_areas.sum())
     weights = rng.dirichlet((1, 1, 1), NUM_ERROR)
-    on_surface = np.einsum("ni,nij->nj", weights, surface.corners[chosen])
+    on_surface = np.einsum("ni,nij->nj", weights, surface.corners[faces])
     direction = rng.normal(size=(NUM_ERROR, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return on_surface + direction * rng.uniform(0, MARGIN, (NUM_ERROR, 1))
@@ -110,20 +109,13 @@ def band(surface: Any, rng: np.random.Generator) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Measure:
-    """Measure error and time of every way to ask."""
+    """Measure error and time of every query."""
 
     file: tyro.conf.Positional[Path]
-    """What `prepare` wrote."""
+    """The file of `prepare`."""
     device: str = "cpu"
-    """Where."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path(".")
     """Folder for geometry-DEVICE.md and geometry-DEVICE.png."""
-    raycast: bool = True
-    """Whether to measure raycast, which needs warp-lang."""
-    compiled: bool = True
-    """Whether to fuse the queries with torch.compile; on a CPU that takes a minute for each tricubic grid."""
-    dtypes: tuple[Literal["float32", "float64"], ...] = ("float32", "float64")
-    """Which dtypes."""
 
     def run(self) -> None:
         """Measure, print, and write table and plot."""
@@ -131,10 +123,10 @@ class Measure:
             arrays = dict(archive)
         rows = []
         for name in dict.fromkeys(key.split("/")[0] for key in arrays):
-            own = {key.removeprefix(f"{name}/"): value for key, value in arrays.items() if key.startswith(f"{name}/")}
-            for dtype in (getattr(torch, each) for each in self.dtypes):
-                for way, nbytes, query, compiled in ways(name, own, dtype, self.device, self.raycast):
-                    rows.append(row(name, way, nbytes, query, compiled and self.compiled, own, dtype, self.device))
+            shape = {key.removeprefix(f"{name}/"): value for key, value in arrays.items() if key.startswith(f"{name}/")}
+            for dtype in (torch.float32, torch.float64):
+                for way, nbytes, query, is_compiled in queries(name, shape, dtype, self.device):
+                    rows.append(row(name, way, nbytes, query, is_compiled, shape, dtype, self.device))
                     print(rows[-1])
         reference = next(r for r in rows if r.shape == "box" and r.way == "analytic").nanoseconds
         write(rows, reference, self.device, self.out)
@@ -142,7 +134,7 @@ class Measure:
 
 @dataclass(frozen=True)
 class Row:
-    """What was measured of one way to ask one shape."""
+    """One query of one shape: bytes, errors of distance [m], 95 % quantile of the gradient's angle [°], and time per point."""
 
     shape: str
     way: str
@@ -157,41 +149,45 @@ class Row:
 Query = Callable[[Any], Any]
 
 
-def ways(
-    name: str, own: dict[str, np.ndarray], dtype: torch.dtype, device: str, raycast: bool
-) -> list[tuple[str, int, Query, bool]]:
-    """Return each way's name, its bytes, its function and whether it is compiled."""
-    found: list[tuple[str, int, Query, bool]] = []
+def queries(name: str, arrays: dict[str, np.ndarray], dtype: torch.dtype, device: str) -> list[tuple[str, int, Query, bool]]:
+    """Return each query's name, bytes, function and whether it is compiled."""
+    result: list[tuple[str, int, Query, bool]] = []
     if name in PRIMITIVES:
         size = vec(torch.tensor(part, dtype=dtype, device=device) for part in PRIMITIVES[name])
-        found.append(("analytic", 0, lambda p, size=size: SHAPES[name](p, size), True))
+        result.append(("analytic", 0, lambda p, size=size: SHAPES[name](p, size), True))
     for tolerance in TOLERANCES:
-        about = json.loads(str(own[f"{tolerance:g}/about"]))
-        values = torch.tensor(own[f"{tolerance:g}/values"], dtype=dtype, device=device)
-        origin = torch.tensor(own[f"{tolerance:g}/origin"], dtype=dtype, device=device)
-        grid = one_grid(values, origin, torch.tensor(about["cell"], dtype=dtype, device=device))
-        method = METHODS[about["method"]]
-        way = f"{about['method']}, {tolerance * 1e3:g} mm"
-        found.append((way, own[f"{tolerance:g}/values"].nbytes, lambda p, m=method, g=grid: m(p, g), True))
-    if raycast:
-        mesh = TriangleMesh(own["vertices"], own["faces"])
-        nbytes = own["vertices"].size * 4 + own["faces"].size * 4
-        found.append(("raycast", nbytes, lambda p, mesh=mesh: nearest(p, [mesh], 2 * MARGIN), False))
-    return found
+        metadata = json.loads(str(arrays[f"{tolerance:g}/about"]))
+        values = torch.tensor(arrays[f"{tolerance:g}/values"], dtype=dtype, device=device)
+        origin = torch.tensor(arrays[f"{tolerance:g}/origin"], dtype=dtype, device=device)
+        grid = one_grid(values, origin, torch.tensor(metadata["cell"], dtype=dtype, device=device))
+        method = METHODS[metadata["method"]]
+        label = f"{metadata['method']}, {tolerance * 1e3:g} mm"
+        result.append((label, arrays[f"{tolerance:g}/values"].nbytes, lambda p, m=method, g=grid: m(p, g), True))
+    mesh = TriangleMesh(arrays["vertices"], arrays["faces"])
+    nbytes = arrays["vertices"].size * 4 + arrays["faces"].size * 4
+    result.append(("raycast", nbytes, lambda p: nearest(p, [mesh], 2 * MARGIN), False))
+    return result
 
 
 def row(
-    name: str, way: str, nbytes: int, query: Query, compiled: bool, own: dict[str, np.ndarray], dtype: torch.dtype, device: str
+    name: str,
+    way: str,
+    nbytes: int,
+    query: Query,
+    is_compiled: bool,
+    shape: dict[str, np.ndarray],
+    dtype: torch.dtype,
+    device: str,
 ) -> Row:
-    """Measure one way."""
-    points = torch.tensor(own["points"], dtype=dtype, device=device)
+    """Measure one query."""
+    points = torch.tensor(shape["points"], dtype=dtype, device=device)
     with torch.no_grad():
         distance, gradient = query(split(points))
-        error = np.abs(distance.double().cpu().numpy() - own["distance"])
-        cosine = (torch.stack(gradient, dim=-1).double().cpu().numpy() * own["normal"]).sum(axis=1)
+        error = np.abs(distance.double().cpu().numpy() - shape["distance"])
+        cosine = (torch.stack(gradient, dim=-1).double().cpu().numpy() * shape["normal"]).sum(axis=1)
         angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
         torch.compiler.reset()
-        call = torch.compile(query, fullgraph=True, dynamic=False) if compiled else query
+        call = torch.compile(query, fullgraph=True, dynamic=False) if is_compiled else query
         repeated = points[torch.arange(NUM_TIME, device=device) % len(points)]
         planes = vec(part.contiguous() for part in split(repeated))
         nanoseconds = 1e9 * median_time(lambda: call(planes), device) / NUM_TIME
@@ -200,7 +196,7 @@ def row(
 
 
 def median_time(call: Callable[[], Any], device: str, repeats: int = 9) -> float:
-    """Return the median duration of a call [s], after two that do not count."""
+    """Return the median duration of a call [s], after two warm-up calls."""
     times = []
     for i in range(repeats + 2):
         if device == "cuda":

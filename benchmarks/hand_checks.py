@@ -1,4 +1,4 @@
-"""Readings of a hand that closes on a ball, against MuJoCo's own functions."""
+"""Compare the readings of a hand that closes on a ball with MuJoCo's functions."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
 
 _STATE = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "mocap_pos", "mocap_quat", "eq_active")
-"""What MuJoCo's evaluation of an instant follows from."""
+"""The state that MuJoCo evaluates."""
 
 
 @dataclass
 class Checked:
-    """The largest errors over some instants, and the most that was felt at one.
+    """The largest errors over some states, and the contacts of the state with the largest forces.
 
     Attributes:
         depth: Error of a taxel's depth [m].
@@ -38,15 +38,15 @@ class Checked:
 
 
 class Oracle:
-    """MuJoCo's own account of what the bodies of a hand feel of a ball."""
+    """Depths and forces of a hand's contacts with a ball, by MuJoCo."""
 
     def __init__(self, model: mujoco.MjModel, layout: Layout, ball: str):
-        """Build a model of two spheres, of which one stands for the taxels and one for the ball.
+        """Build a model of two spheres: a taxel and the ball.
 
         Args:
             model: The scene.
             layout: The taxels.
-            ball: Name of the ball's body, of one geom.
+            ball: Name of the ball's body, which has one geom.
         """
         self.model, self.data, self.layout = model, mujoco.MjData(model), layout
         self.ball = int(model.body_geomadr[model.body(ball).id])
@@ -54,20 +54,20 @@ class Oracle:
         self.bodies = [int(model.body(name).id) for name in layout.bodies]
         spec = mujoco.MjSpec()
         for name, radius in (("taxel", 1.0), ("ball", float(model.geom_size[self.ball, 0]))):
-            own = spec.worldbody.add_body(name=name, mocap=True)
-            own.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0])
+            sphere = spec.worldbody.add_body(name=name, mocap=True)
+            sphere.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0])
         self._pair = spec.compile()
-        self._placed = mujoco.MjData(self._pair)
+        self._pair_data = mujoco.MjData(self._pair)
 
     def evaluate(self, sim: BatchSimulation) -> None:
-        """Take over the state of a simulation's only environment, and evaluate it."""
+        """Copy the state of a simulation's only environment, and evaluate it."""
         for name in _STATE:
             getattr(self.data, name)[...] = np.asarray(getattr(sim.batch, name))[0].reshape(getattr(self.data, name).shape)
         mujoco.mj_forward(self.model, self.data)
 
     def forces(self) -> dict[int, Float[np.ndarray, " 3"]]:
         """Return the force on each body that the ball touches, in the body's frame [N]."""
-        found: dict[int, np.ndarray] = {}
+        result: dict[int, np.ndarray] = {}
         for i, contact in enumerate(self.data.contact):
             if self.ball not in contact.geom or contact.efc_address < 0:
                 continue
@@ -77,54 +77,54 @@ class Oracle:
             is_second = int(contact.geom[0]) == self.ball
             body = int(self.model.geom_bodyid[contact.geom[1 if is_second else 0]])
             force = self.data.xmat[body].reshape(3, 3).T @ (on_second if is_second else -on_second)
-            found[body] = found.get(body, np.zeros(3)) + force
-        return found
+            result[body] = result.get(body, np.zeros(3)) + force
+        return result
 
     def depths(self, touched: Mapping[int, object]) -> Float[np.ndarray, " taxel"]:
-        """Return how deep each taxel's sphere is in the ball, on bodies that are in contact with it [m]."""
-        found = np.zeros(self.layout.num_taxels)
-        self._placed.mocap_pos[1] = self.data.geom_xpos[self.ball]
+        """Return the penetration of each taxel's sphere and the ball, on bodies in contact with it [m]."""
+        result = np.zeros(self.layout.num_taxels)
+        self._pair_data.mocap_pos[1] = self.data.geom_xpos[self.ball]
         for i in np.flatnonzero(np.isin(self.body, list(touched))):
             body = self.body[i]
             pos = self.data.xpos[body] + self.data.xmat[body].reshape(3, 3) @ self.layout.pos[i]
-            self._placed.mocap_pos[0] = pos
+            self._pair_data.mocap_pos[0] = pos
             self._pair.geom_size[0, 0] = self._pair.geom_rbound[0] = self.layout.radius[i]
-            mujoco.mj_kinematics(self._pair, self._placed)
-            found[i] = max(0.0, -mujoco.mj_geomDistance(self._pair, self._placed, 0, 1, 10.0, None))
-        return found
+            mujoco.mj_kinematics(self._pair, self._pair_data)
+            result[i] = max(0.0, -mujoco.mj_geomDistance(self._pair, self._pair_data, 0, 1, 10.0, None))
+        return result
 
 
 def check(touch: TactileModule, sim: BatchSimulation, control: Float[np.ndarray, "step actuator"], instants: int) -> Checked:
-    """Step a scene through controls, and compare what is read with MuJoCo's own at some instants.
+    """Step a scene through controls, and compare readings with MuJoCo's values in some states.
 
     Args:
         touch: A float64 module with the sensors `depth`, `force` and `solver` on the same links, and the object `ball`.
-        sim: Its simulation, of one environment.
-        control: What the actuators are told at each step.
-        instants: How many are compared, the last among them.
+        sim: Its simulation, with one environment.
+        control: Control of the actuators at each step.
+        instants: Number of states, of which the last follows the last control.
     """
     layout = touch.plan.layout_of(next(sensor for sensor in touch.plan.sensors if sensor.name == "depth"))
-    oracle, found = Oracle(sim.model, layout, "ball"), Checked()
-    chosen = set(np.linspace(0, len(control) - 1, instants).round().astype(int).tolist())
+    oracle, result = Oracle(sim.model, layout, "ball"), Checked()
+    compared = set(np.linspace(0, len(control) - 1, instants).round().astype(int).tolist())
     for i, row in enumerate(control):
         sim.step(row)
-        if i in chosen:
+        if i in compared:
             oracle.evaluate(sim)
             sim.forward()
-            _compare(oracle, touch(sim.state()), found)
-    return found
+            _compare(oracle, touch(sim.state()), result)
+    return result
 
 
-def _compare(oracle: Oracle, readings: Mapping[str, Tensor], found: Checked) -> None:
-    read = {name: value[0].double().numpy() for name, value in readings.items()}
+def _compare(oracle: Oracle, readings: Mapping[str, Tensor], result: Checked) -> None:
+    values = {name: value[0].double().numpy() for name, value in readings.items()}
     forces = oracle.forces()
     depth = oracle.depths(forces)
-    found.depth = max(found.depth, float(np.abs(read["depth"][:, 0] - depth).max()))
+    result.depth = max(result.depth, float(np.abs(values["depth"][:, 0] - depth).max()))
     newtons = 0.0
     for row, body in enumerate(oracle.bodies):
         expected = forces.get(body, np.zeros(3))
-        shared = read["force"][oracle.body == body].sum(axis=0) + read["force/missed"][row]
-        errors = np.abs(np.stack([shared, read["solver"][row, 1:]]) - expected)
-        found.force, newtons = max(found.force, float(errors.max())), newtons + float(np.linalg.norm(expected))
-    if newtons >= found.newtons:
-        found.links, found.taxels, found.newtons = len(forces.keys() & set(oracle.bodies)), int((depth > 0).sum()), newtons
+        shared = values["force"][oracle.body == body].sum(axis=0) + values["force/missed"][row]
+        errors = np.abs(np.stack([shared, values["solver"][row, 1:]]) - expected)
+        result.force, newtons = max(result.force, float(errors.max())), newtons + float(np.linalg.norm(expected))
+    if newtons >= result.newtons:
+        result.links, result.taxels, result.newtons = len(forces.keys() & set(oracle.bodies)), int((depth > 0).sum()), newtons

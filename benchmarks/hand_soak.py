@@ -1,10 +1,10 @@
-"""Minutes of reading an emulated XHand1 at the highest rate that its line allows: what was lost, how even the readings came.
+"""Read an emulated XHand1 for minutes at the highest rate of its line: count lost readings, and measure periods and ages.
 
 python benchmarks/hand_soak.py --seconds 600
 
-The emulated line takes as long as 3 Mbaud do: 297 bytes out and 2217 back are 8.38 ms, 119.3 readings a second at the most.
-Every state that the hand sends has a number in it, so that a reading that is lost, repeated or stale shows. Waits are patient,
-so that only the line can lose something, not a machine that is busy with other things: what is late shows in the percentiles.
+The emulated line runs at 3 Mbaud: 297 bytes out and 2217 back take 8.38 ms, so it carries at most 119.3 readings a second. Each
+state of the hand contains a number, which reveals lost, repeated and stale readings. Timeouts are long, so that only the line
+can lose readings, not a busy machine: delays show in the percentiles.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from tgdsl.runtime.xhand1.wire.client import BAUD, SerialCounters, SerialTiming
 from tgdsl.runtime.xhand1.wire.protocol import COMMAND_SIZE, OVERHEAD, STATE_SIZE
 
 WIRE_S = 10 * (COMMAND_SIZE + STATE_SIZE + 2 * OVERHEAD) / BAUD
-"""Time that an exchange's bytes are on the line [s]."""
-PATIENT = SerialTiming(reply_timeout_s=20.0, silence_s=10.0)
+"""Time of an exchange's bytes on the line [s]."""
+LONG_TIMEOUTS = SerialTiming(reply_timeout_s=20.0, silence_s=10.0)
 
 
 class NumberedStates(Body):
-    """A body that writes into the thumb's first taxels how many states the hand has sent."""
+    """A body that writes the number of sent states into the thumb's first taxels."""
 
     def __init__(self) -> None:
         self.num = 0
 
     def felt(self, time_s: float) -> tuple[Float[np.ndarray, " joint"], TipForces]:
-        """Number one more."""
+        """Return forces that encode the next number."""
         taxel = np.zeros((5, 120, 3))
         taxel[0, :4, 2] = list(self.num.to_bytes(4, "little"))
         self.num += 1
@@ -47,14 +47,14 @@ def number_of(reading: Reading) -> int:
 
 @dataclass(frozen=True)
 class Soak:
-    """What happened.
+    """Results of a run.
 
     Attributes:
-        seconds: From the first reading to the last [s].
-        numbers: Number of each reading that was fetched.
-        received_at: When each came [s].
-        age: How old each could be when it was fetched [s].
-        counters: What happened on the line.
+        seconds: Time from the first reading to the last [s].
+        numbers: Number in each fetched reading.
+        received_at: Time at which each arrived [s].
+        age: Upper bound of each one's age when it was fetched [s].
+        counters: Counters of the line.
         num_lost_bytes: Bytes that the emulator could not deliver.
     """
 
@@ -67,16 +67,16 @@ class Soak:
 
     @property
     def num_lost(self) -> int:
-        """Exchanges that brought no reading; the one that is under way at the end is not counted."""
+        """Exchanges without a reading, except the one in progress at the end."""
         return max(self.counters.num_requests - self.counters.num_replies - 1, 0)
 
     @property
     def num_superseded(self) -> int:
-        """Readings that were here, but were replaced by a newer one before they were fetched."""
+        """Readings that a newer one replaced before they were fetched."""
         return int(self.numbers[-1] - self.numbers[0]) + 1 - len(self.numbers)
 
     def text(self) -> str:
-        """Return the account."""
+        """Return the report."""
         period = 1e3 * np.diff(self.received_at) / np.maximum(np.diff(self.numbers), 1)
         rate = (self.numbers[-1] - self.numbers[0]) / self.seconds
         counters = self.counters
@@ -93,7 +93,7 @@ class Soak:
 
 
 def soak(seconds: float) -> Soak:
-    """Read for so long [s]; each reading must be whole, new and in order.
+    """Read for some time [s]; each reading must be complete, new and in order.
 
     Raises:
         HandError: If a reading does not come within 30 s.
@@ -101,7 +101,7 @@ def soak(seconds: float) -> Soak:
     numbers, received_at, ages = [], [], []
     with (
         Emulator(EmulatedHand(body=NumberedStates())) as emulator,
-        XHand1.open(emulator.device, timing=PATIENT, max_age_s=30.0) as hand,
+        XHand1.open(emulator.device, timing=LONG_TIMEOUTS, max_age_s=30.0) as hand,
     ):
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
@@ -121,12 +121,12 @@ def _percentiles(values: np.ndarray) -> str:
 
 
 def main() -> None:
-    """Soak, and print the account; the exit code is 1 if anything was lost."""
+    """Print the report; the exit code is 1 if anything was lost."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=600.0, help="for how long [s]")
-    found = soak(parser.parse_args().seconds)
-    print(found.text())
-    raise SystemExit(int(bool(found.num_lost or found.num_lost_bytes)))
+    parser.add_argument("--seconds", type=float, default=600.0, help="duration [s]")
+    result = soak(parser.parse_args().seconds)
+    print(result.text())
+    raise SystemExit(int(bool(result.num_lost or result.num_lost_bytes)))
 
 
 if __name__ == "__main__":

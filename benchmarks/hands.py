@@ -1,12 +1,11 @@
-"""Hands and grippers that other packages bring, through the whole line: links, layout, compile, explain, run, render, USD.
+"""Take hands and grippers of other packages through all stages: links, layout, render, USD, compile, explain, run, compare.
 
     pip install --no-deps gymnasium-robotics robosuite dm_control orca-sim gym-aloha mani-skill genesis-world
     python benchmarks/hands.py [NAME ...] [--out out/hands] [--pictures docs/images/hands]
 
-Each hand is looked for inside its installed package; one that is not there is skipped by name. Nothing of a file is edited: a
-layout is proposed, and a document of four kinds of sensor on its group `hand` feels a ball on which `tgdsl run` closes it. On
-the way the readings are checked against MuJoCo's own, in float64 (see `hand_checks`): depths against `mj_geomDistance`,
-forces against `mj_contactForce`.
+Hands whose package is not installed are skipped. No file is edited: a layout is proposed, and four kinds of sensor on its group
+`hand` feel a ball, on which `tgdsl run` closes the hand. Readings are compared with MuJoCo's functions in float64 (see
+`hand_checks`): depths with `mj_geomDistance`, forces with `mj_contactForce`.
 """
 
 from __future__ import annotations
@@ -46,22 +45,24 @@ from tgdsl.runtime.rollout import controls_between
 DENSITY = "1/cm2"
 """Taxels per area at `med`."""
 RADII = (0.025, 0.015, 0.01, 0.006)
-"""Radii of the ball that are tried, from the largest [m]."""
+"""Radii of the ball to try, largest first [m]."""
 SECONDS = 1.0
-"""How long the hand is open, closes, and is closed [s]."""
+"""Duration of each phase: the hand is open, closes, and is closed [s]."""
 SUBSTEPS = 10
 """Physics steps per control step of `tgdsl run`."""
+TIMEOUT = 600.0
+"""Time limit of a hand [s]."""
 INSTANTS = 12
-"""States of a grasp at which readings are compared with MuJoCo's."""
+"""States of a grasp at which readings are compared."""
 LIMIT = 1e-9
-"""Largest error of a depth [m] and of a force [N]."""
+"""Limit of the errors of depths [m] and forces [N]."""
 SENSORS = {"depth": "contact_depth", "touch": "kinematic_taxel", "force": "force_taxel", "solver": "link_contact"}
-"""The document's sensors, by name: their kinds."""
+"""Names and kinds of the document's sensors."""
 
 
 @dataclass(frozen=True)
 class Hand:
-    """Where a hand's file is: in which installed package, and where inside of it."""
+    """A hand's package, and the path of its file inside."""
 
     package: str
     file: str
@@ -105,23 +106,23 @@ HANDS = {
 
 @dataclass
 class Row:
-    """What came of a hand.
+    """Results of a hand.
 
     Attributes:
-        name: The hand's.
-        version: The package's.
-        joints: Joints of the robot.
-        links: Links with taxels.
-        taxels: Number of them at each resolution.
-        groups: Members of each proposed group, groups resolved.
-        outside: Share of the taxels at `med` on links that are not in `hand`.
-        facing: Links whose inner side was found.
-        warnings: What was warned of or printed past Python, each once, by stage.
+        name: Name of the hand.
+        version: Version of the package.
+        joints: Number of the robot's joints.
+        links: Number of links with taxels.
+        taxels: Number of taxels at each resolution.
+        groups: Number of links in each proposed group.
+        outside: Share of the taxels at `med` on links outside `hand`.
+        facing: Number of links whose inner side was recognised.
+        warnings: Distinct warnings, and output past Python, with their stage.
         explained: Lines of `explain` about taxels that feel nothing.
-        felt: What the hand felt of the ball, see `hand_checks.Checked`.
-        usd: How the robot differs that came back from USD; empty if it does not.
+        felt: Errors and contacts, see `hand_checks.Checked`.
+        usd: Differences of the robot imported from USD; empty without any.
         seconds: Time of each stage [s].
-        error: The stage that failed, and why.
+        error: Failed stages, and reasons.
     """
 
     name: str
@@ -140,8 +141,8 @@ class Row:
     error: str = ""
 
 
-def found(hand: Hand) -> tuple[Path, str] | None:
-    """Return a hand's file and its package's version; None if that is not installed."""
+def locate(hand: Hand) -> tuple[Path, str] | None:
+    """Return a hand's file and its package's version; None if it is not installed."""
     try:
         distribution = importlib.metadata.distribution(hand.package)
     except importlib.metadata.PackageNotFoundError:
@@ -150,11 +151,11 @@ def found(hand: Hand) -> tuple[Path, str] | None:
     return (file, distribution.version) if file.is_file() else None
 
 
-class Line:
-    """The stages, for one hand."""
+class Stages:
+    """The stages of a hand."""
 
     def __init__(self, name: str, file: Path, version: str, out: Path, pictures: Path | None):
-        """Prepare a folder of its own for the files of the stages."""
+        """Create the folder for the files of the stages."""
         self.row, self.file, self.folder = Row(name, version), file.resolve(), out / name
         self.folder.mkdir(parents=True, exist_ok=True)
         self.layout, self.document = self.folder / "layout.yaml", self.folder / "hand.yaml"
@@ -162,34 +163,34 @@ class Line:
         self.artefact = self.folder / "hand.safetensors"
 
     def run(self) -> Row:
-        """Take the hand through all stages; what fails ends in the row, and what needs it is left out."""
+        """Take the hand through all stages; failures are in the row, and stages that depend on a failed one are skipped."""
         stages: tuple[Callable[[], None], ...] = (
             *(self.links, self.layout_new, self.render, self.usd),
             *(self.compile, self.explain, self.run_scene, self.compare),
         )
         for stage in stages:
-            start, said = time.perf_counter(), []
+            start, messages = time.perf_counter(), []
             try:
-                with overheard(said):
+                with collected_messages(messages):
                     stage()
-            except Exception as error:  # a row says what failed, and the table goes on
-                what = str(error) if isinstance(error, TgdslError) else f"{type(error).__name__}: {error}"
-                self.row.error += f"{stage.__name__}: {what}\n"
+            except Exception as error:  # the row names the failure, and the table goes on
+                message = str(error) if isinstance(error, TgdslError) else f"{type(error).__name__}: {error}"
+                self.row.error += f"{stage.__name__}: {message}\n"
             self.row.seconds[stage.__name__] = round(time.perf_counter() - start, 1)
-            self.row.warnings += [f"{stage.__name__}: {text}" for text in dict.fromkeys(said)]
+            self.row.warnings += [f"{stage.__name__}: {text}" for text in dict.fromkeys(messages)]
             (self.folder / "row.json").write_text(json.dumps(asdict(self.row), indent=1))
             if self.row.error and stage.__name__ not in ("render", "usd", "explain", "run_scene"):
                 break
         return self.row
 
     def links(self) -> None:
-        """`tgdsl links`."""
-        printed(Links(str(self.file)).run)
+        """Run `tgdsl links`."""
+        output_of(Links(str(self.file)).run)
         self.row.joints = load_model(self.file).compiled.njnt
 
     def layout_new(self) -> None:
-        """`tgdsl layout new`, and what it proposed."""
-        printed(New(str(self.file), density=DENSITY, out=self.layout, force=True).run)
+        """Run `tgdsl layout new`, and count its proposals."""
+        output_of(New(str(self.file), density=DENSITY, out=self.layout, force=True).run)
         by_resolution = placed(self._robot()).layouts
         self.row.taxels = {name: layout.num_taxels for name, layout in by_resolution.items()}
         self.med = by_resolution["med"]
@@ -201,56 +202,56 @@ class Line:
         self.row.facing = text.count("facing:")
 
     def render(self) -> None:
-        """`tgdsl render`, at `med`, small."""
+        """Run `tgdsl render` at `med`, small."""
         self.picture.parent.mkdir(parents=True, exist_ok=True)
         view = Render(str(self.file), self.layout, ("med",), view="iso", size=(360, 360), out=self.picture)
-        printed(view.run)
+        output_of(view.run)
         with Image.open(self.picture) as picture:
             colours = picture.convert("RGB").convert("P", palette=Image.Palette.ADAPTIVE, colors=64)
         colours.save(self.picture, optimize=True)
 
     def compile(self) -> None:
-        """Write the document, with the largest ball that fits into the hand, and `tgdsl compile` it."""
-        why = ""
+        """Run `tgdsl compile` on a document with the largest ball that fits into the hand."""
+        reason = ""
         for radius in RADII:
             self.document.write_text(json.dumps(self._document(radius), indent=1))  # JSON is YAML
-            printed(Compile(self.document, out=self.artefact).run)
+            output_of(Compile(self.document, out=self.artefact).run)
             closing = closing_of(load(self.artefact))
             if not isinstance(closing, str):
                 self.closing = closing
                 return
-            why = closing
-            if "does not fit" not in why:  # then no other ball will
+            reason = closing
+            if "does not fit" not in reason:  # then a smaller ball does not help
                 break
-        raise TgdslError(f"the hand closes on no ball of {1e3 * min(RADII):g} to {1e3 * max(RADII):g} mm: {why}")
+        raise TgdslError(f"the hand closes on no ball of {1e3 * min(RADII):g} to {1e3 * max(RADII):g} mm: {reason}")
 
     def explain(self) -> None:
-        """`tgdsl explain`; what it says of taxels that feel nothing is kept."""
-        text = printed(Explain(self.artefact).run)
+        """Run `tgdsl explain`; select its lines about taxels that feel nothing."""
+        text = output_of(Explain(self.artefact).run)
         self.row.explained = [line.strip() for line in text.splitlines() if re.search("buried|deaf|feel nothing|never", line)]
 
     def run_scene(self) -> None:
-        """`tgdsl run`: the hand opens and closes on the ball."""
-        printed(Run(self.artefact, seconds=SECONDS, substeps=SUBSTEPS, out=self.folder).run)
+        """Run `tgdsl run`: the hand opens and closes on the ball."""
+        output_of(Run(self.artefact, seconds=SECONDS, substeps=SUBSTEPS, out=self.folder).run)
 
     def compare(self) -> None:
-        """Compare readings with MuJoCo's own."""
+        """Compare readings with MuJoCo's functions."""
         touch = load(self.artefact, dtype="float64")
         sim = BatchSimulation(touch, 1, keyframe=START, prepare=self.closing.prepare)
         control = controls_between(self.closing.targets(sim.model.nu), SECONDS, sim.control_step)
         self.row.felt = asdict(check(touch, sim, control, INSTANTS))
-        wrong = [f"{what} by {self.row.felt[what]:.1e}" for what in ("depth", "force") if not self.row.felt[what] <= LIMIT]
-        if wrong:
-            raise TgdslError(f"readings differ from MuJoCo's: {', '.join(wrong)}")
+        errors = {name: self.row.felt[name] for name in ("depth", "force")}
+        if not all(error <= LIMIT for error in errors.values()):
+            raise TgdslError(f"readings differ from MuJoCo's: {errors}")
         if not self.row.felt["links"]:
             raise TgdslError("the hand does not reach the ball")
 
     def usd(self) -> None:
-        """`tgdsl export-usd` and `tgdsl import`: the robot must come back as it was."""
-        stage, back = self.folder / "robot.usda", self.folder / "back.xml"
-        printed(ExportUsd(str(self.file), stage).run)
-        printed(Import(stage, back).run)
-        self.row.usd = difference(load_model(self.file).compiled, load_model(back).compiled)
+        """Run `tgdsl export-usd` and `tgdsl import`, and compare the imported robot."""
+        stage, imported = self.folder / "robot.usda", self.folder / "back.xml"
+        output_of(ExportUsd(str(self.file), stage).run)
+        output_of(Import(stage, imported).run)
+        self.row.usd = difference(load_model(self.file).compiled, load_model(imported).compiled)
 
     def _document(self, radius: float) -> dict[str, object]:
         return {
@@ -265,28 +266,28 @@ class Line:
 
 
 def difference(one: mujoco.MjModel, two: mujoco.MjModel) -> str:
-    """Return in what two robots differ: counts, mass, and where their bodies of the same name are at the start."""
+    """Return the differences of two robots: counts, mass, and positions of bodies of the same name at the start."""
     parts = []
     for name in ("nbody", "njnt", "ngeom", "nu", "neq", "ntendon"):
         if getattr(one, name) != getattr(two, name):
             parts.append(f"{name} {getattr(one, name)} → {getattr(two, name)}")
     if abs(one.body_mass.sum() - two.body_mass.sum()) > 1e-6:
         parts.append(f"mass {one.body_mass.sum():.4g} → {two.body_mass.sum():.4g} kg")
-    places = []
+    positions = []
     for model in (one, two):
         state = mujoco.MjData(model)
         mujoco.mj_kinematics(model, state)
-        places.append({model.body(i).name: state.xpos[i] for i in range(model.nbody)})
-    common = places[0].keys() & places[1].keys() - {""}
-    if lost := sorted(places[0].keys() - common - {""}):
+        positions.append({model.body(i).name: state.xpos[i] for i in range(model.nbody)})
+    common = positions[0].keys() & positions[1].keys() - {""}
+    if lost := sorted(positions[0].keys() - common - {""}):
         parts.append(f"without {', '.join(lost)}")
-    if common and (off := max(float(np.abs(places[0][n] - places[1][n]).max()) for n in common)) > 1e-6:
-        parts.append(f"bodies off by {1e3 * off:.2g} mm")
+    if common and (offset := max(float(np.abs(positions[0][n] - positions[1][n]).max()) for n in common)) > 1e-6:
+        parts.append(f"bodies off by {1e3 * offset:.2g} mm")
     return ", ".join(parts)
 
 
-def printed(command: Callable[[], None]) -> str:
-    """Run a command and return what it prints."""
+def output_of(command: Callable[[], None]) -> str:
+    """Run a command and return its output."""
     text = StringIO()
     with redirect_stdout(text):
         command()
@@ -294,11 +295,11 @@ def printed(command: Callable[[], None]) -> str:
 
 
 @contextmanager
-def overheard(said: list[str]) -> Iterator[None]:
-    """Collect warnings, and what is written to standard output and error past Python."""
+def collected_messages(messages: list[str]) -> Iterator[None]:
+    """Collect warnings, and output to the descriptors of standard output and error."""
     sys.stdout.flush()
     sys.stderr.flush()
-    kept = os.dup(1), os.dup(2)
+    originals = os.dup(1), os.dup(2)
     with tempfile.TemporaryFile() as file, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for number in (1, 2):
@@ -308,76 +309,73 @@ def overheard(said: list[str]) -> Iterator[None]:
         finally:
             sys.stdout.flush()
             sys.stderr.flush()
-            for own, number in zip(kept, (1, 2), strict=True):
-                os.dup2(own, number)
-                os.close(own)
+            for original, number in zip(originals, (1, 2), strict=True):
+                os.dup2(original, number)
+                os.close(original)
             file.seek(0)
-            said += [f"(raw) {line.strip()}" for line in file.read().decode(errors="replace").splitlines() if line.strip()]
-            said += [f"{entry.category.__name__}: {entry.message}" for entry in caught]
+            messages += [f"(raw) {line.strip()}" for line in file.read().decode(errors="replace").splitlines() if line.strip()]
+            messages += [f"{entry.category.__name__}: {entry.message}" for entry in caught]
 
 
-def printed_row(row: Row, hand: Hand) -> list[str]:
-    """Return a row's lines."""
+def lines_of(row: Row, hand: Hand) -> list[str]:
+    """Return a row as lines of text."""
     counts = " ".join(f"{row.taxels.get(name, 0):>6}" for name in FACTORS)
     groups = " ".join(f"{name} {count}" for name, count in row.groups.items())
-    felt = "".join(
-        f"; {row.felt['links']} links, {row.felt['taxels']} taxels, {row.felt['newtons']:.2f} N; "
-        f"errors {row.felt['depth']:.0e} m, {row.felt['force']:.0e} N"
-        for _ in range(bool(row.felt))
-    )
+    felt = ""
+    if row.felt:
+        felt = "; {links} links, {taxels} taxels, {newtons:.2f} N; errors {depth:.0e} m, {force:.0e} N".format(**row.felt)
     lines = [f"{row.name:<14}{row.joints:>4} joints {row.links:>3} links ({row.facing} facing) {counts}  {groups}"]
     lines.append(
         f"    {hand.package} {row.version}; {100 * row.outside:.0f} % outside `hand`{felt}; USD: {row.usd or 'the same'}"
     )
     lines.append("    " + ", ".join(f"{stage} {seconds:g} s" for stage, seconds in row.seconds.items()))
     lines += [f"    explain: {line}" for line in row.explained]
-    shown = [text[:400] for text in row.warnings]
-    lines += [f"    warned: {text}" for text in shown[:12]]
-    lines += [f"    and {len(shown) - 12} more" for _ in range(len(shown) > 12)]
+    lines += [f"    warned: {text[:400]}" for text in row.warnings[:12]]
+    if len(row.warnings) > 12:
+        lines.append(f"    and {len(row.warnings) - 12} more")
     return lines + [f"    FAILED in {line}" for line in row.error.splitlines()]
 
 
 def main() -> int:
-    """Print the table; return how many hands failed."""
+    """Print the table; return the number of hands that failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(HANDS)}; default: all")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"{', '.join(HANDS)}; default: all")
     parser.add_argument("--out", type=Path, default=Path("out/hands"), help="folder for the stages' files")
-    parser.add_argument("--pictures", type=Path, help="folder for the pictures; default: that of the hand's other files")
-    parser.add_argument("--timeout", type=float, default=600.0, help="for one hand [s]")
+    parser.add_argument("--pictures", type=Path, help="folder for the pictures; default: in --out")
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if unknown := [name for name in options.names if name not in HANDS]:
         parser.error(f"there is no hand {', '.join(unknown)}; expected some of {', '.join(HANDS)}")
     failed = 0
     for name in options.names or HANDS:
-        place = found(HANDS[name])
-        if place is None:
+        location = locate(HANDS[name])
+        if location is None:
             print(f"{name:<14} skipped: {HANDS[name].package} with {HANDS[name].file} is not installed", flush=True)
             continue
         if options.child:
-            Line(name, *place, options.out, options.pictures).run()
+            Stages(name, *location, options.out, options.pictures).run()
             continue
-        row = in_own_process(name, place[1], options)
+        row = run_child(name, location[1], options)
         failed += bool(row.error)
-        print("\n".join(printed_row(row, HANDS[name])), flush=True)
+        print("\n".join(lines_of(row, HANDS[name])), flush=True)
     return failed
 
 
-def in_own_process(name: str, version: str, options: argparse.Namespace) -> Row:
-    """Return a hand's row, made in a process of its own: what crashes or hangs costs the rest of one row."""
+def run_child(name: str, version: str, options: argparse.Namespace) -> Row:
+    """Return a hand's row from a separate process, which may crash or hang."""
     file = options.out / name / "row.json"
     file.unlink(missing_ok=True)
     command = [sys.executable, __file__, name, "--child", "--out", str(options.out)]
     command += ["--pictures", str(options.pictures)] if options.pictures else []
-    why = ""
+    reason = ""
     try:
-        ended = subprocess.run(command, timeout=options.timeout, capture_output=True, text=True)
-        if ended.returncode:
-            why = f"exit code {ended.returncode}: {ended.stderr.strip()[-300:]}"
+        child = subprocess.run(command, timeout=TIMEOUT, capture_output=True, text=True)
+        if child.returncode:
+            reason = f"exit code {child.returncode}: {child.stderr.strip()[-300:]}"
     except subprocess.TimeoutExpired:
-        why = f"not done after {options.timeout:g} s"
+        reason = f"not done after {TIMEOUT:g} s"
     row = Row(**json.loads(file.read_text())) if file.is_file() else Row(name, version)
-    row.error += why
+    row.error += reason
     return row
 
 

@@ -1,10 +1,10 @@
-"""The proximity taxel by a baked field and by sampled points: error against the converged surface integral, and time.
+"""Compare the proximity taxel by a baked field and by sampled points: error against the surface integral, and time.
 
     python benchmarks/proximity.py [--device cuda] [--num-envs 1024] [--num-taxels 100] [--repeats 10] [--eager]
 
-A 4 cm cube and probes of 10 mm radius spread over a pad of its size, at random poses within reach. Medians of calls made in
-turn; errors are root mean squares of the normal force over its largest magnitude, against the surface integral summed over
-points every 0.1 mm, at the probes of the first environments.
+A 4 cm cube is at random poses within reach of probes of 10 mm radius on a pad of its size. Times are medians of alternating
+calls. Errors of the normal force, relative to its largest magnitude, are against the surface integral as a sum over points
+every 0.1 mm, in the first environments.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ SCENE = """
 TRUE_ENVS = 24
 """Environments whose readings are compared."""
 ROOM = 2**29
-"""Budget of fields and lists [bytes]."""
+"""Memory limit of fields and lists [bytes]."""
 BACKENDS: dict[str, dict[str, Any]] = {
     "field, 0.5 %": {"tolerance": 0.005},
     "field, 2 %": {"tolerance": 0.02},
@@ -49,12 +49,10 @@ BACKENDS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Options:
-    """What to time."""
+    """The command line."""
 
     device: str = "cpu"
-    """Where."""
     num_envs: int = 1024
-    """Environments."""
     num_taxels: int = 100
     """Taxels, a square number."""
     repeats: int = 10
@@ -78,7 +76,7 @@ def module(folder: Path, options: Options, **sensor: Any) -> TactileModule:
     return tgdsl.compile(document, device=options.device)
 
 
-def near(touch: TactileModule, num_envs: int) -> SceneState:
+def nearby_state(touch: TactileModule, num_envs: int) -> SceneState:
     """Return random states in which the cube is in front of the pad, 0 to 8 mm away."""
     state = touch.example_state(num_envs, dtype=torch.float32, spread=0.004)
     assert state.body_pos is not None and state.body_quat is not None
@@ -91,7 +89,7 @@ def near(touch: TactileModule, num_envs: int) -> SceneState:
 
 
 def probes(num_taxels: int) -> list[list[float]]:
-    """Return the places of the probes on the pad [m]."""
+    """Return the positions of the probes on the pad [m]."""
     side = round(num_taxels**0.5)
     line = [0.04 * ((i + 0.5) / side - 0.5) for i in range(side)]
     return [[x, y, 0.002] for x in line for y in line]
@@ -102,10 +100,10 @@ def converged(state: SceneState, num_taxels: int) -> Tensor:
     assert state.body_pos is not None and state.body_quat is not None
     geom = Geom(0, "", "", "cube", "box", np.full(3, 0.02), np.zeros(3), np.eye(3), True)
     surface = outer_surface([SurfaceGeom(geom, None)], 1e-4).quadrature(1e-4)
-    place, turn = state.body_pos[:TRUE_ENVS].double().cpu().numpy(), state.body_quat[:TRUE_ENVS].double().cpu().numpy()
+    positions, quats = (value[:TRUE_ENVS].double().cpu().numpy() for value in (state.body_pos, state.body_quat))
     cube, pad = 0, 1  # the bodies are sorted by name
     forces = []
-    for pos, quat in zip(place, turn, strict=True):
+    for pos, quat in zip(positions, quats, strict=True):
         to_world, to_cube = (Rotation.from_quat(quat[body], scalar_first=True) for body in (pad, cube))
         world = pos[pad] + to_world.apply(probes(num_taxels))
         moments = moment_sums(surface, to_cube.inv().apply(world - pos[cube]), 0.01, 4, block=1)
@@ -114,18 +112,18 @@ def converged(state: SceneState, num_taxels: int) -> Tensor:
 
 
 def main(options: Options) -> None:
-    """Print one table."""
-    where = torch.cuda.get_device_name() if options.device == "cuda" else f"CPU, {torch.get_num_threads()} threads"
-    print(f"torch {torch.__version__}, {where}, {options.num_envs} × {options.num_taxels}, medians of {options.repeats}\n")
-    rows, calls, found = {}, {}, {}
+    """Print the table."""
+    machine = torch.cuda.get_device_name() if options.device == "cuda" else f"CPU, {torch.get_num_threads()} threads"
+    print(f"torch {torch.__version__}, {machine}, {options.num_envs} × {options.num_taxels}, medians of {options.repeats}\n")
+    rows, calls, forces = {}, {}, {}
     with TemporaryDirectory() as folder, torch.no_grad():
-        state = near(module(Path(folder), options, tolerance=0.02), options.num_envs)
+        state = nearby_state(module(Path(folder), options, tolerance=0.02), options.num_envs)
         true = converged(state, options.num_taxels)
         for name, sensor in BACKENDS.items():
             start = time.perf_counter()
             touch = module(Path(folder), options, **sensor)
             rows[name] = time.perf_counter() - start, sum(b.numel() * b.element_size() for b in touch.constants.buffers())
-            found[name] = touch(state)["s"][: len(true), :, 2].double().cpu()
+            forces[name] = touch(state)["s"][: len(true), :, 2].double().cpu()
             if not options.eager:
                 touch.compile()
             calls[name] = lambda touch=touch: touch(state)
@@ -133,7 +131,7 @@ def main(options: Options) -> None:
     first = times[next(iter(times))]
     print("| backend | error, RMS | largest | ms | ratio | constants, MiB | compiled in, s |\n|---|---|---|---|---|---|---|")
     for name, (seconds, size) in rows.items():
-        error = (found[name] - true).abs() / true.abs().max()
+        error = (forces[name] - true).abs() / true.abs().max()
         rms = f"{100 * error.square().mean().sqrt():.2f} % | {100 * error.max():.2f} %"
         print(f"| {name} | {rms} | {times[name]:.3f} | {times[name] / first:.1f} | {size / 2**20:.1f} | {seconds:.1f} |")
 
