@@ -96,6 +96,8 @@ def test_from_a_teacher_to_students_that_play(base, here):
     student = ("--policy", "out/task_students/default/students/depth-all-clean-s0.pt", "--episodes", "2", "--envs", "2")
     code, out, error = here(base, "evaluate", "task.yaml", *student, "--set", "touch=depth", "--set", "placement=all")
     assert code == 0 and out.startswith("score "), error
+    code, out, error = here(base, "layout", "from-gates", student[1])
+    assert (code, out) == (0, "layout_gates.yaml\nlayout_gates.low.csv\n"), error
     code, out, error = here(base, "evaluate", "task.yaml", *student, "--set", "touch=depth", "--set", "placement=tip")
     assert code == 2 and "this policy feels with other taxels" in error
     code, out, error = here(
