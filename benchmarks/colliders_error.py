@@ -1,14 +1,14 @@
-"""Errors of primitive colliders, capped iterations and tolerances in C MuJoCo in float64, and which pairs of links come near.
+"""Errors of primitive colliders, capped iterations and tolerances in C MuJoCo in float64, and pairs of links in contact.
 
-Used by colliders.py. From the same states, with the same targets, against mesh colliders with 100 iterations and a tolerance of
-1e-8, of the same friction cone:
+Used by colliders.py. Variants start from the same states with the same targets. They are compared with mesh colliders, 100
+iterations and a tolerance of 1e-8, with the same friction cone:
 
-- `mm_1`, `mm_10`, `deg_1`, `deg_10`: how far the object is elsewhere after one and after ten control steps, RMS over states;
-- `force_%`: forces on links after one control step, RMS of the difference over RMS of the forces; the states are those of the
-  mesh colliders, so that primitives begin up to a millimetre apart or in the object;
-- `load_%`: sum of the forces' magnitudes after ten control steps, over that of the exact ones;
+- `mm_1`, `mm_10`, `deg_1`, `deg_10`: error of the object's pose after one and ten control steps, RMS over states;
+- `force_%`: RMS error of the forces on links after one control step, over their RMS; states are from mesh colliders, so that
+  primitives start with gaps or penetrations up to a millimetre;
+- `load_%`: sum of the forces' magnitudes after ten control steps, over the exact one;
 - `depth_mm`: mean over states of the deepest penetration after ten control steps;
-- `stays_%`: in how many states the object is still on the palm at the end; `rounds`: Newton's, mean.
+- `stays_%`: share of the states at whose end the object is still on the palm; `rounds`: mean number of Newton iterations.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from tgdsl.scene.scene import Choice, SceneModels
 
 COLLISIONS, CONES = ("mesh", "primitive"), ("pyramidal", "elliptic")
 VISIT = 12
-"""Control steps until joints go elsewhere."""
+"""Control steps until joints get new goals."""
 EXACT = {"iterations": 100, "ls_iterations": 50, "tolerance": 1e-8}
 
 
 @dataclass(frozen=True)
 class Variant:
-    """Colliders, friction cone, and the options of the solver that differ from the scene's."""
+    """Colliders, friction cone, and options of the solver that differ from the scene's."""
 
     collision: str
     cone: str
@@ -45,16 +45,16 @@ class Variant:
 
     @property
     def name(self) -> str:
-        """The variant as a row's first column."""
-        shown = " ".join(f"{name}={value:g}" for name, value in self.options.items())
-        return f"{self.collision:<9} {self.cone:<9} {shown or '-':<32}"
+        """The first columns of the variant's row."""
+        options = " ".join(f"{name}={value:g}" for name, value in self.options.items())
+        return f"{self.collision:<9} {self.cone:<9} {options or '-':<32}"
 
 
 class Scenes:
     """The task's scene in C MuJoCo, with each kind of colliders, for each variant of the object."""
 
     def __init__(self, task: Path):
-        """Compile both."""
+        """Compile the scene with each kind of colliders."""
         self.scenes, self.names = {}, {}
         for collision in COLLISIONS:
             loaded = load_task(task, {"physics.collision": collision, "touch": "none"})
@@ -75,7 +75,7 @@ class Scenes:
 
 @dataclass(frozen=True, eq=False)
 class Instant:
-    """Where a scene is, and the targets of the control steps that follow, (step, actuator)."""
+    """A state, and the targets of the control steps after it (step, actuator)."""
 
     number: int
     qpos: np.ndarray
@@ -90,53 +90,52 @@ def advance(model: mujoco.MjModel, data: mujoco.MjData, target: np.ndarray, subs
 
 
 def targets(model: mujoco.MjModel, start: np.ndarray, moved: np.ndarray, steps: int, rng: np.random.Generator) -> np.ndarray:
-    """Return targets as the task's actions make them: joints go to one random place after another, 0.05 rad a control step."""
+    """Return targets like those of the task's actions: joints move to random goals by at most 0.05 rad per control step."""
     low, high = model.actuator_ctrlrange.T
-    found, now, goal = [], start.copy(), start.copy()
+    result, now, goal = [], start.copy(), start.copy()
     for i in range(steps):
         if i % VISIT == 0:
             goal[moved] = (low + (high - low) * rng.uniform(0.05, 0.95, len(low)))[moved]
         now[moved] += np.clip(goal - now, -0.05, 0.05)[moved]
-        found.append(now.copy())
-    return np.array(found)
+        result.append(now.copy())
+    return np.array(result)
 
 
 def instants(scenes: Scenes, count: int, ahead: int, seed: int = 0) -> list[Instant]:
-    """Return states in which fingers move an object on the palm, of all its variants in turn."""
-    rng, found = np.random.default_rng(seed), []
+    """Return states in which fingers move an object on the palm, with all variants of the object in turn."""
+    rng, result = np.random.default_rng(seed), []
     reference = Variant("mesh", "elliptic")
     for i in range(count):
         model = scenes.model(reference, i % 16)
         data = mujoco.MjData(model)
         mujoco.mj_resetDataKeyframe(model, data, 0)
         moved = np.array([j for j in range(model.nu) if "thumb" in model.actuator(j).name or "_mid" in model.actuator(j).name])
-        own = model.body(scenes.body).jntadr[0]
-        place = int(model.jnt_qposadr[own])
-        data.qpos[place : place + 2] += rng.uniform(-0.01, 0.01, 2)
-        before = int(rng.integers(10, 50))
-        made = targets(model, model.key_ctrl[0], moved, before + ahead, rng)
-        for target in made[:before]:
+        address = int(model.jnt_qposadr[model.body(scenes.body).jntadr[0]])
+        data.qpos[address : address + 2] += rng.uniform(-0.01, 0.01, 2)
+        lead = int(rng.integers(10, 50))
+        series = targets(model, model.key_ctrl[0], moved, lead + ahead, rng)
+        for target in series[:lead]:
             advance(model, data, target, scenes.spec.physics.substeps)
-        found.append(Instant(i % 16, data.qpos.copy(), data.qvel.copy(), made[before:]))
-    return found
+        result.append(Instant(i % 16, data.qpos.copy(), data.qvel.copy(), series[lead:]))
+    return result
 
 
 def link_forces(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> np.ndarray:
     """Return the force of each body's geoms on the object in the world [N], (body, 3)."""
-    found, wrench = np.zeros((model.nbody, 3)), np.zeros(6)
+    forces, wrench = np.zeros((model.nbody, 3)), np.zeros(6)
     for i in range(data.ncon):
         contact = data.contact[i]
         one, two = (int(model.geom_bodyid[geom]) for geom in contact.geom)
         if body in (one, two):
             mujoco.mj_contactForce(model, data, i, wrench)
             force = contact.frame.reshape(3, 3).T @ wrench[:3]  # on the second geom's body
-            found[one if two == body else two] += force if two == body else -force
-    return found
+            forces[one if two == body else two] += force if two == body else -force
+    return forces
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one instant: the object's place [m] and orientation after 1 and 10 steps, forces, penetration [m]."""
+    """The end of a run: the object's positions [m] and orientations after 1 and 10 steps, forces [N], penetration [m]."""
 
     place: np.ndarray
     turn: np.ndarray
@@ -148,7 +147,7 @@ class Outcome:
 
 
 def outcome(scenes: Scenes, variant: Variant, instant: Instant) -> Outcome:
-    """Run one instant with a variant."""
+    """Run from an instant with a variant."""
     model = scenes.model(variant, instant.number)
     data, body = mujoco.MjData(model), int(model.body(scenes.body).id)
     data.qpos[:], data.qvel[:] = instant.qpos, instant.qvel
@@ -176,9 +175,9 @@ def angles(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.degrees(2 * np.arccos(np.clip(np.abs((one * other).sum(axis=-1)), 0, 1)))
 
 
-def compared(variant: Variant, own: Sequence[Outcome], exact: Sequence[Outcome]) -> dict[str, Any]:
+def compared(variant: Variant, outcomes: Sequence[Outcome], exact: Sequence[Outcome]) -> dict[str, Any]:
     """Return a row of the table: a variant against the exact one."""
-    pairs = list(zip(own, exact, strict=True))
+    pairs = list(zip(outcomes, exact, strict=True))
     moved = np.array([np.linalg.norm(a.place - b.place, axis=1) for a, b in pairs])
     turned = np.array([angles(a.turn, b.turn) for a, b in pairs])
     forces, differences = np.array([b.force for _, b in pairs]), np.array([a.force - b.force for a, b in pairs])
@@ -188,10 +187,10 @@ def compared(variant: Variant, own: Sequence[Outcome], exact: Sequence[Outcome])
         row[f"mm_{steps}_median"] = 1e3 * float(np.median(moved[:, i]))
         row[f"deg_{steps}"] = float(np.sqrt((turned[:, i] ** 2).mean()))
     row["force_%"] = 100.0 * float(np.sqrt((differences**2).sum() / (forces**2).sum()))
-    row["load_%"] = 100.0 * sum(a.load for a in own) / sum(b.load for b in exact)
-    row["depth_mm"] = 1e3 * statistics.fmean(a.depth for a in own)
-    row["stays_%"] = 100.0 * statistics.fmean(a.stays for a in own)
-    row["rounds"] = statistics.fmean(a.rounds for a in own)
+    row["load_%"] = 100.0 * sum(a.load for a in outcomes) / sum(b.load for b in exact)
+    row["depth_mm"] = 1e3 * statistics.fmean(a.depth for a in outcomes)
+    row["stays_%"] = 100.0 * statistics.fmean(a.stays for a in outcomes)
+    row["rounds"] = statistics.fmean(a.rounds for a in outcomes)
     return row
 
 
@@ -201,14 +200,14 @@ COLUMNS = ("mm_1", "mm_10", "mm_10_median", "deg_1", "deg_10", "force_%", "load_
 def error(options: argparse.Namespace) -> list[dict[str, Any]]:
     """Return a row per variant of colliders and options, each against the exact one with its own cone."""
     scenes = Scenes(options.task)
-    found = instants(scenes, options.states, options.ahead)
+    starts = instants(scenes, options.states, options.ahead)
     print(f"{'variant':<52} {' '.join(f'{name:>12}' for name in COLUMNS)}")
     rows = []
-    exact = {cone: [outcome(scenes, Variant("mesh", cone), own) for own in found] for cone in options.cones}
+    exact = {cone: [outcome(scenes, Variant("mesh", cone), start) for start in starts] for cone in options.cones}
     for cone in options.cones:
-        for collision, chosen in itertools.product(options.collisions, options.error_variants):
-            variant = Variant(collision, cone, chosen)
-            rows.append(compared(variant, [outcome(scenes, variant, own) for own in found], exact[cone]))
+        for collision, solver in itertools.product(options.collisions, options.error_variants):
+            variant = Variant(collision, cone, solver)
+            rows.append(compared(variant, [outcome(scenes, variant, start) for start in starts], exact[cone]))
             print(variant.name, " ".join(f"{rows[-1][name]:12.3f}" for name in COLUMNS), flush=True)
             write(options, "error", rows)
     if len(options.cones) == 2:
@@ -220,16 +219,16 @@ def error(options: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def pairs(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Return per kind of colliders how many pairs of geoms may meet, and which bodies came into contact in a run."""
+    """Return per kind of colliders the number of pairs of geoms that may meet, and the pairs of bodies in contact in a run."""
     scenes, rows = Scenes(options.task), []
-    found = instants(scenes, options.states, options.ahead)
+    starts = instants(scenes, options.states, options.ahead)
     for collision in options.collisions:
         variant, met, least = Variant(collision, "elliptic"), dict[str, int](), dict[str, float]()
-        for own in found:
-            model = scenes.model(variant, own.number)
+        for start in starts:
+            model = scenes.model(variant, start.number)
             data = mujoco.MjData(model)
-            data.qpos[:], data.qvel[:] = own.qpos, own.qvel
-            for target in own.targets:
+            data.qpos[:], data.qvel[:] = start.qpos, start.qvel
+            for target in start.targets:
                 advance(model, data, target, scenes.spec.physics.substeps)
                 for k in range(data.ncon):
                     bodies = sorted(int(model.geom_bodyid[geom]) for geom in data.contact[k].geom)
@@ -246,7 +245,7 @@ def pairs(options: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def candidates(model: mujoco.MjModel) -> dict[str, int]:
-    """Return how many pairs of geoms bits, exclusions and the tree of bodies let meet, by what they are."""
+    """Return the number of pairs of geoms that may meet by collision bits, exclusions and the tree of bodies, by kind."""
     counts = {"link – link": 0, "link – object": 0, "world – other": 0}
     excluded = set(model.exclude_signature.tolist())
     for a, b in itertools.combinations(range(model.ngeom), 2):

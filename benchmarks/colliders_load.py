@@ -1,17 +1,16 @@
-"""Why an object that is squeezed is loaded more by primitive colliders than by meshes: compliance of contacts, in C MuJoCo.
+"""Load on squeezed objects by collider and by compliance of contacts, in C MuJoCo: primitives load them more than meshes do.
 
-Used by colliders.py. Objects that links hold are left to settle for a second under constant targets, in the same states, with
-several colliders and values of `solimp`'s d. A contact with the elliptic cone is at rest a spring of stiffness
+Used by colliders.py. Objects held by links settle for a second under constant targets, from the same states, with several
+colliders and values of `solimp`'s d. With the elliptic cone, a contact at rest is a spring of stiffness
 
     f / r = 1 / ((1 − d) t² A)        d: impedance [1], t: time constant of `solref` [s], A: inverse inertia [1/kg]
 
-(MuJoCo's documentation, Computation, Constraint model), whatever the number of contacts of a pair: n of them are n times as
-stiff.
-Where their compliance exceeds the drives', the load depends on n: on the algorithm that finds contacts.
+(MuJoCo's documentation, Computation, Constraint model). Each contact of a pair is such a spring: n contacts are n times as
+stiff. Where their compliance exceeds the drives', the load depends on n, and so on the algorithm that detects contacts.
 
-- `load_%`: of the object, median over states of the ratio to that with meshes of the same cone and d;
-- `force`: its mean [N]; `contacts`: of the object, mean; `depth_mm`: of the deepest one, mean;
-- `held`: in how many of the states the object is still held; the means are of those in which meshes hold it too.
+- `load_%`: load of the object over that with meshes of the same cone and d, median over states;
+- `force`, `contacts`, `depth_mm`: mean load [N], number of the object's contacts, and greatest depth;
+- `held`: number of states in which the object is still held; means are over those in which meshes hold it too.
 """
 
 from __future__ import annotations
@@ -26,9 +25,9 @@ import numpy as np
 from colliders_error import Instant, Scenes, Variant, advance, link_forces
 
 IMPEDANCES = (None, 0.99, 0.999)
-"""d of `solimp`, constant with depth; None: the scene's own."""
+"""d of `solimp`, constant with depth; None: the scene's."""
 HELD = 1.0
-"""Load that an object bears which is held, not only carried [N]."""
+"""Load above which an object is held, not only carried [N]."""
 SETTLING = 40
 """Control steps of constant targets."""
 KINDS = ("mesh", "mesh, one contact a pair", "primitive")
@@ -42,42 +41,31 @@ def load(options: argparse.Namespace) -> list[dict[str, Any]]:
     print(f"{'colliders':<26} {'cone':<9} d      load_%  force contacts depth_mm held")
     for cone in options.cones:
         for impedance in IMPEDANCES:
-            found = {kind: np.array([_settled(scenes, kind, cone, impedance, own)[1:] for own in held]) for kind in KINDS}
-            for kind, own in found.items():
-                rows.append({"colliders": kind, "cone": cone, "d": impedance} | _row(own, found["mesh"]))
-                values = "{load_%:6.0f} {force:6.2f} {contacts:8.2f} {depth_mm:8.2f} {held:4d}".format_map(rows[-1])
-                print(f"{kind:<26} {cone:<9} {impedance or 'scene':<6} {values}", flush=True)
+            loads = {kind: np.array([_settled(scenes, kind, cone, impedance, start)[1:] for start in held]) for kind in KINDS}
+            for kind, values in loads.items():
+                rows.append({"colliders": kind, "cone": cone, "d": impedance} | _row(values, loads["mesh"]))
+                text = "{load_%:6.0f} {force:6.2f} {contacts:8.2f} {depth_mm:8.2f} {held:4d}".format_map(rows[-1])
+                print(f"{kind:<26} {cone:<9} {impedance or 'scene':<6} {text}", flush=True)
     colliders_error.write(options, "load", rows)
     return rows
 
 
-def stiffness(impedance: float, time_constant: float, inverse_inertia: float) -> float:
-    """Return the stiffness of a contact at rest with the elliptic cone [N/m].
-
-    Args:
-        impedance: d of `solimp`.
-        time_constant: The first number of `solref` [s].
-        inverse_inertia: Of both bodies, at the contact along its normal [1/kg].
-    """
-    return 1 / ((1 - impedance) * time_constant**2 * inverse_inertia)
-
-
 def _held(scenes: Scenes, count: int) -> list[Instant]:
     """Return settled states with meshes and the elliptic cone in which links hold the object."""
-    found = []
-    for own in colliders_error.instants(scenes, count, 10):
-        qpos, force, *_ = _settled(scenes, "mesh", "elliptic", None, own)
+    result = []
+    for start in colliders_error.instants(scenes, count, 10):
+        qpos, force, *_ = _settled(scenes, "mesh", "elliptic", None, start)
         if force > HELD:
-            found.append(Instant(own.number, qpos, np.zeros_like(own.qvel), own.targets[-1:]))
-    return found
+            result.append(Instant(start.number, qpos, np.zeros_like(start.qvel), start.targets[-1:]))
+    return result
 
 
 def _settled(
     scenes: Scenes, kind: str, cone: str, impedance: float | None, instant: Instant
 ) -> tuple[np.ndarray, float, int, float]:
-    """Return positions, and load [N], number and greatest depth [m] of the object's contacts, once targets have been held."""
+    """Return positions, and load [N], number and greatest depth [m] of the object's contacts, after constant targets."""
     model = scenes.model(Variant(kind.split(",")[0], cone), instant.number)
-    kept, flags = model.geom_solimp.copy(), model.opt.disableflags
+    solimp, flags = model.geom_solimp.copy(), model.opt.disableflags
     if impedance is not None:
         model.geom_solimp[:, :2] = impedance
     if "one" in kind:
@@ -89,13 +77,13 @@ def _settled(
     mujoco.mj_forward(model, data)
     near = [-data.contact[k].dist for k in range(data.ncon) if body in model.geom_bodyid[data.contact[k].geom]]
     force = float(np.linalg.norm(link_forces(model, data, body), axis=1).sum())
-    model.geom_solimp[:], model.opt.disableflags = kept, flags
+    model.geom_solimp[:], model.opt.disableflags = solimp, flags
     return data.qpos.copy(), force, len(near), max([0.0, *near])
 
 
-def _row(own: np.ndarray, exact: np.ndarray) -> dict[str, Any]:
-    both = (own[:, 0] > HELD) & (exact[:, 0] > HELD)
-    force, contacts, depth = (float(value) for value in own[both].mean(axis=0)) if both.any() else (0.0, 0.0, 0.0)
-    ratio = 100.0 * statistics.median(own[both, 0] / exact[both, 0]) if both.any() else 0.0
+def _row(values: np.ndarray, exact: np.ndarray) -> dict[str, Any]:
+    both = (values[:, 0] > HELD) & (exact[:, 0] > HELD)
+    force, contacts, depth = (float(value) for value in values[both].mean(axis=0)) if both.any() else (0.0, 0.0, 0.0)
+    ratio = 100.0 * statistics.median(values[both, 0] / exact[both, 0]) if both.any() else 0.0
     numbers = {"load_%": ratio, "force": force, "contacts": contacts, "depth_mm": 1e3 * depth}
-    return numbers | {"held": int((own[:, 0] > HELD).sum())}
+    return numbers | {"held": int((values[:, 0] > HELD).sum())}

@@ -1,4 +1,4 @@
-"""Draw what a policy does: instants side by side in one image, or a GIF in real time with the taxels on a translucent hand.
+"""Draw the motion of a policy: a strip of instants in one image, or a GIF in real time with taxels on a translucent hand.
 
     MUJOCO_GL=osmesa python benchmarks/gait_strip.py examples/tasks/screwdriver.yaml policies/screwdriver.pt --every 0.05 \
         --distance 0.45 --azimuth=200 --elevation=-25 --out docs/images/screwdriver.png
@@ -6,7 +6,7 @@
         policies/in_palm_rotate_cube_held.pt --set touch=force_taxel --first 2.075 --every 0.05 --frames 45 --distance 0.175 \
         --azimuth=60 --elevation=-50 --out docs/images/turn.gif
 
-One environment with the task's first variant, in MuJoCo, without exploration.
+One environment with the task's first variant runs in MuJoCo, without exploration.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from tgdsl.rl.playing.policy import policy_for, read_policy
 from tgdsl.view.trace import TouchTrace
 
 COLUMNS, ROWS, WIDTH, HEIGHT = 6, 2, 240, 200
-"""Images beside and below one another, and pixels of each."""
+"""Images per row, rows, and pixels of each image."""
 FRAME = (480, 300)
 """Pixels of a GIF's frame."""
 HAND, OBJECT, HIDDEN = (0.55, 0.58, 0.64, 0.36), (0.3, 0.5, 0.8, 1.0), (0.0, 0.0, 0.0, 0.0)
 
 
 def poses(options: argparse.Namespace) -> tuple[mujoco.MjModel, int, list[np.ndarray], TouchTrace]:
-    """Return the model, the object's body, and `qpos` and the first sensor's readings at the instants that are drawn."""
+    """Return the model, the object's body, and `qpos` and the first sensor's readings at each instant."""
     env = TouchEnv(options.task, 1, seed=options.seed, overrides=parsed_overrides(tuple(options.set)))
     policy, obs, instants = policy_for(env, read_policy(options.policy)), env.reset(), []
     first, every = (round(time / env.control_step) for time in (options.first, options.every))
@@ -41,9 +41,9 @@ def poses(options: argparse.Namespace) -> tuple[mujoco.MjModel, int, list[np.nda
         if step >= first and (step - first) % every == 0:
             trace.add(len(instants), env.now.readings)
             instants.append(env.sim.qpos[0].double().numpy().copy())
-        made = env.step(policy(obs))
-        obs = made.obs
-        if made.info.ended.any():
+        result = env.step(policy(obs))
+        obs = result.obs
+        if result.info.ended.any():
             raise SystemExit(f"the episode ends after {step + 1} control steps, before the last instant: take another --seed")
     model = env.sim.model
     body = int(model.body(env.task.setup.object).id)
@@ -54,7 +54,7 @@ def poses(options: argparse.Namespace) -> tuple[mujoco.MjModel, int, list[np.nda
 def images(
     model: mujoco.MjModel, body: int, instants: list[np.ndarray], options: argparse.Namespace, trace: TouchTrace | None
 ) -> Iterator[Image.Image]:
-    """Yield an image of each instant; the camera looks at where the object is at the first one."""
+    """Yield an image of each instant; the camera looks at the object's first position."""
     width, height = (WIDTH, HEIGHT) if trace is None else (2 * FRAME[0], 2 * FRAME[1])
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     data, camera = mujoco.MjData(model), mujoco.MjvCamera()
@@ -81,11 +81,11 @@ def strip(frames: Iterable[Image.Image]) -> Image.Image:
 
 
 def draw_taxels(scene: mujoco.MjvScene, model: mujoco.MjModel, data: mujoco.MjData, trace: TouchTrace, step: int) -> None:
-    """Add the taxels to a scene; those that read something glow."""
+    """Add the taxels to a scene; those with nonzero readings glow."""
     first = scene.ngeom
     trace.draw(scene, model, data, step)
     for geom in scene.geoms[first : scene.ngeom]:
-        geom.emission = 0.9 if np.ptp(geom.rgba[:3]) > 0.2 else 0.0  # grey ones read nothing
+        geom.emission = 0.9 if np.ptp(geom.rgba[:3]) > 0.2 else 0.0  # grey: the reading is 0
 
 
 def darken(model: mujoco.MjModel, body: int) -> None:
@@ -100,26 +100,26 @@ def darken(model: mujoco.MjModel, body: int) -> None:
 
 
 def palette(frames: list[Image.Image]) -> Image.Image:
-    """Return an image with 160 colours for all frames, half of them for the warm colours of taxels, which cover few pixels."""
+    """Return an image with 160 colours for all frames; half of them are warm colours of taxels, which cover few pixels."""
     pixels = np.concatenate([np.asarray(frame).reshape(-1, 3) for frame in frames[:: max(1, len(frames) // 6)]])
     warm = pixels[pixels[:, 0] > pixels[:, 2].astype(int) + 25]
-    both = np.concatenate([pixels, np.resize(warm, pixels.shape)]) if len(warm) else pixels
-    return Image.fromarray(both.reshape(-1, FRAME[0], 3)).quantize(160, method=Image.Quantize.MEDIANCUT)
+    balanced = np.concatenate([pixels, np.resize(warm, pixels.shape)]) if len(warm) else pixels
+    return Image.fromarray(balanced.reshape(-1, FRAME[0], 3)).quantize(160, method=Image.Quantize.MEDIANCUT)
 
 
 def main() -> None:
-    """Draw one."""
+    """Draw a strip or a GIF."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task", type=Path)
     parser.add_argument("policy", type=Path)
     parser.add_argument("--first", type=float, default=2.0, help="first instant [s]")
-    parser.add_argument("--every", type=float, default=0.075, help="from one to the next [s]")
-    parser.add_argument("--frames", type=int, default=COLUMNS * ROWS, help="instants")
-    parser.add_argument("--distance", type=float, default=0.3, help="of the camera from the object [m]")
-    parser.add_argument("--azimuth", type=float, default=150.0, help="of where it looks [deg]")
-    parser.add_argument("--elevation", type=float, default=-40.0, help="the same [deg]")
+    parser.add_argument("--every", type=float, default=0.075, help="time between instants [s]")
+    parser.add_argument("--frames", type=int, default=COLUMNS * ROWS, help="number of instants")
+    parser.add_argument("--distance", type=float, default=0.3, help="distance of the camera from the object [m]")
+    parser.add_argument("--azimuth", type=float, default=150.0, help="azimuth of the camera [deg]")
+    parser.add_argument("--elevation", type=float, default=-40.0, help="elevation of the camera [deg]")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="of the task's document")
+    parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="change the task's document")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     model, body, instants, trace = poses(options)

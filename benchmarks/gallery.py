@@ -1,10 +1,10 @@
-"""Draw the small pictures of `examples/README.md` into docs/images/gallery: examples, tasks, and a panel for each kind.
+"""Draw the small pictures of `examples/README.md` into docs/images/gallery: examples, tasks, and a panel per kind.
 
     MUJOCO_GL=egl python benchmarks/gallery.py                  # all, minutes on one core
-    MUJOCO_GL=egl python benchmarks/gallery.py tasks/hot_ball   # this picture alone
+    MUJOCO_GL=egl python benchmarks/gallery.py tasks/hot_ball   # one picture
 
-A document is stepped as by `tgdsl run`, a task by its kept policy or at rest.
-Taxels that read something are large and coloured. `plugins/plugins` needs `pip install examples/plugins`.
+A document is stepped as by `tgdsl run`, a task by its published policy or without actions.
+Taxels with nonzero readings are large and coloured. `plugins/plugins` needs `pip install examples/plugins`.
 docs/images/motors.png is the spectrogram of `tgdsl listen examples/every_sensor.yaml --sensors motors`.
 """
 
@@ -18,7 +18,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
-import torch._dynamo  # before OpenGL: later, its LLVM and that of Mesa end the process
+import torch._dynamo  # before OpenGL: loaded later, its LLVM and Mesa's crash the process
 from gait_strip import darken, draw_taxels
 from PIL import Image
 
@@ -47,7 +47,7 @@ class Shot:
     seconds: float = 1.5
     overrides: tuple[tuple[str, object], ...] = ()
     hides: str = ""
-    """A body that hides the others, and is not drawn."""
+    """A body in front of the others, drawn almost transparent."""
 
 
 SHOTS = {
@@ -78,7 +78,7 @@ SHOTS = {
 }
 PANELS = ("contact", "contact_depth", "surface_distance", "kinematic_taxel", "force_taxel", None, None, "link_contact")
 PANELS += ("proximity", "elastomer", "temperature_grid")
-"""Kinds of the panels of docs/images/every_sensor.png, which `tgdsl run examples/every_sensor.yaml` writes, in rows of four."""
+"""Kinds in the panels of docs/images/every_sensor.png (by `tgdsl run examples/every_sensor.yaml`), in rows of four."""
 CROPS = {
     "every_sensor": ("every_sensor.png", (0, 50, 1560, 1133)),
     "warm_palm": ("warm_palm.png", (0, 100, 624, 590)),
@@ -93,11 +93,11 @@ CROPS |= {
     for i, kind in enumerate(PANELS)
     if kind is not None
 }
-"""Pictures that are parts of others: the file in docs/images, and left, top, right and bottom [pixel]."""
+"""Crops of other pictures: the file in docs/images, and left, top, right and bottom [pixel]."""
 
 
 def document(name: str) -> tuple[mujoco.MjModel, np.ndarray, TouchTrace]:
-    """Return the scene of a document, its last `qpos`, and its first readings on taxels then."""
+    """Return the scene of a document, and the `qpos` and readings of the step with most nonzero taxels."""
     path = ROOT / "examples" / f"{name}.yaml"
     touch = tgdsl.compile(path)
     with tempfile.TemporaryDirectory() as folder:
@@ -105,14 +105,14 @@ def document(name: str) -> tuple[mujoco.MjModel, np.ndarray, TouchTrace]:
         record = dict(np.load(Path(folder) / "readings.npz"))
     output = first_on_taxels([*touch.outputs])
     trace = TouchTrace(touch, output, 1)
-    best = int(np.argmax((np.abs(record[output.name]) > 0.0).sum(axis=(1, 2, 3))))
-    trace.add(0, {output.name: torch.as_tensor(record[output.name][best])})
+    step = int(np.argmax((np.abs(record[output.name]) > 0.0).sum(axis=(1, 2, 3))))
+    trace.add(0, {output.name: torch.as_tensor(record[output.name][step])})
     sim = tgdsl.simulate(touch, 1)
-    return sim.env_model(0), record["qpos"][best, 0], trace
+    return sim.env_model(0), record["qpos"][step, 0], trace
 
 
 def task(name: str, shot: Shot) -> tuple[mujoco.MjModel, np.ndarray, TouchTrace]:
-    """Return the scene of a task, `qpos` after some seconds, and the readings then."""
+    """Return the scene of a task, and its `qpos` and readings after some seconds."""
     env = TouchEnv(ROOT / "examples" / f"{name}.yaml", 1, seed=0, overrides=dict(shot.overrides))
     policy = policy_for(env, read_policy(ROOT / "policies" / f"{shot.policy}.pt")) if shot.policy else None
     obs = env.reset()
@@ -129,7 +129,7 @@ def first_on_taxels(outputs: list[Output]) -> Output:
 
 
 def picture(model: mujoco.MjModel, qpos: np.ndarray, trace: TouchTrace, shot: Shot) -> Image.Image:
-    """Return a picture."""
+    """Draw a picture."""
     darken(model, model.body(shot.at).id)
     if shot.hides:
         model.geom_rgba[model.geom_bodyid == model.body(shot.hides).id, 3] = 0.1
@@ -145,8 +145,8 @@ def picture(model: mujoco.MjModel, qpos: np.ndarray, trace: TouchTrace, shot: Sh
         return Image.fromarray(renderer.render()).resize(SIZE, Image.Resampling.LANCZOS)
 
 
-def part(name: str) -> Image.Image:
-    """Return a part of another picture, not larger than `SIZE`."""
+def crop(name: str) -> Image.Image:
+    """Return a crop of another picture, at most as large as `SIZE`."""
     file, box = CROPS[name]
     image = Image.open(ROOT / "docs" / "images" / file).convert("RGB").crop(box)
     image.thumbnail(SIZE, Image.Resampling.LANCZOS)
@@ -154,14 +154,14 @@ def part(name: str) -> Image.Image:
 
 
 def main() -> None:
-    """Draw some or all."""
+    """Draw the named pictures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", help="pictures; default: all")
     names = parser.parse_args().names
     OUT.mkdir(exist_ok=True)
     for name in names or (*SHOTS, *CROPS):
         if name in CROPS:
-            save(part(name), name)
+            save(crop(name), name)
         else:
             scene = task(name, SHOTS[name]) if name.startswith("tasks/") else document(name)
             save(picture(*scene, SHOTS[name]), name.replace("/", "_"))

@@ -1,9 +1,9 @@
-"""Make policies' files half as large: weights in float16, taxels to five digits; cards and normalisation stay as they are.
+"""Halve the size of policies' files: weights in float16, taxels to five digits; cards and normalisation do not change.
 
     python benchmarks/halve_policies.py policies/*.pt
 
-`tgdsl` reads such weights as float32. A file is replaced only if the policy's actions stay what they were, to a hundredth, for
-observations as normalisation expects them. Prints of each the largest change of an action, and both sizes [KiB].
+`tgdsl` reads such weights as float32. A file is replaced only if the policy's actions change by at most a hundredth, for random
+observations with the mean and variance of the normalisation. The largest change of an action and both sizes are printed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tgdsl.rl.playing.policy import CARD, read_policy
 
 TAXELS, DIGITS = "taxels.csv", 5
 MOST_CHANGE = 0.01
-"""Of an action, whose range is of the order of 1."""
+"""Largest accepted change of an action, whose range is of the order of 1."""
 
 
 def halved(content: bytes) -> bytes:
@@ -39,7 +39,7 @@ def halved(content: bytes) -> bytes:
 
 
 def largest_change(one: torch.jit.ScriptModule, other: torch.jit.ScriptModule, rows: int = 1000) -> float:
-    """Return how far the actions of two policies are apart at most, for observations around what normalisation expects."""
+    """Return the largest difference of two policies' actions, for observations by the mean and variance of normalisation."""
     buffers = {name.rpartition(".")[2].lstrip("_"): value for name, value in one.named_buffers()}
     deviation = buffers["var"].flatten().sqrt()
     torch.manual_seed(0)
@@ -53,15 +53,15 @@ def _text(value: str | bytes) -> str:
 
 
 def _rounded(table: str) -> str:
-    """Return a table whose numbers have few digits."""
+    """Return a table with rounded numbers."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     for row in csv.reader(io.StringIO(table)):
-        writer.writerow([_short(cell) for cell in row])
+        writer.writerow([_rounded_cell(cell) for cell in row])
     return text.getvalue()
 
 
-def _short(cell: str) -> str:
+def _rounded_cell(cell: str) -> str:
     try:
         return f"{float(cell):.{DIGITS}g}" if "." in cell or "e" in cell else cell
     except ValueError:
@@ -69,7 +69,6 @@ def _short(cell: str) -> str:
 
 
 def main() -> None:
-    """Halve each file that the command line names."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("files", nargs="+", type=Path)
     for file in parser.parse_args().files:

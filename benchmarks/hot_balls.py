@@ -1,4 +1,4 @@
-"""Whether a hand can learn to find a ball by its heat: documents of the paper's settings, and a table of what was learned.
+"""Write documents of the paper's settings in which a hand learns to find a ball by its heat, and tabulate their evaluations.
 
     python benchmarks/hot_balls.py documents out/hot_balls
     cd out/hot_balls                                                # then for each setting NAME:
@@ -6,9 +6,9 @@
     tgdsl evaluate NAME.yaml --policy NAME/policy.pt --out NAME.json
     python benchmarks/hot_balls.py table out/hot_balls
 
-`documents` writes examples/tasks/hot_ball.yaml and bin.yaml once for each setting, with other fingers: by physics those of
-bin.yaml, walls of half a millimetre whose pad lies on 1 cm²; by the paper's formula solid ones, with π δ for an area, δ = 1 mm.
-`table` has a row for each setting that was evaluated: seconds S on the hot ball with the latch on, beside the paper's mark.
+`documents` writes examples/tasks/hot_ball.yaml and bin.yaml for each setting, with different fingers. By physics they are those
+of bin.yaml: walls of half a millimetre with a contact area of 1 cm². By the paper's formula they are solid, with π δ as the
+area, δ = 1 mm. `table` has a row per evaluated setting: seconds S on the hot ball with the latch on, and the paper's result.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from tgdsl.files.write import atomic_write_all, with_folder
 
 TASKS = Path(__file__).parents[1] / "examples" / "tasks"
 LIKE = {1.0: "glass", 10.0: "stainless_steel", 100.0: "aluminium", 150.0: "aluminium"}
-"""What a fingertip of each of the paper's conductivities [W/(m·K)] is like in all else."""
+"""Material with a fingertip's other properties, by the paper's conductivities [W/(m·K)]."""
 WALL = 0.1
-"""Share of a finger's box that is solid, where it is a thin wall."""
+"""Solid share of a thin-walled finger's box."""
 PAPERS_AREA = 3.1416e-3
-"""π δ for a penetration of 1 mm: a length, which the paper's formula takes for an area."""
+"""π δ for a penetration of 1 mm: a length, which the paper's formula uses as an area."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A cell of the paper's table, and by whose conduction.
+    """A cell of the paper's table, and the model of conduction.
 
     Attributes:
         model: "physics" or "paper".
-        conductivity: Of the fingers [W/(m·K)].
-        emissivity: Of the fingers.
-        flux: Heat made in them, per area of one end [W/m²].
+        conductivity: Conductivity of the fingers [W/(m·K)].
+        emissivity: Emissivity of the fingers.
+        flux: Power of the heaters per area of one end [W/m²].
     """
 
     model: str
@@ -55,12 +55,12 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """What its files are called."""
+        """Stem of its files."""
         return f"{self.model}_{self.conductivity:g}_{self.emissivity:g}"
 
     @property
     def is_found_by_the_paper(self) -> bool:
-        """Whether the paper's hand keeps in touch with the ball: its figure on temperature."""
+        """Whether the paper's hand keeps touching the ball, by its figure on temperature."""
         return self.conductivity == 150.0 and self.emissivity == 0.5
 
 
@@ -72,9 +72,10 @@ SETTINGS = (
     Setting("paper", 1.0, 0.5),
     Setting("paper", 10.0, 0.5),
 )
-"""In these a pressed fingertip latches within 20 s by docs/background/heat.md, or walls are as thin; one of steel never does.
+"""Settings in which a pressed fingertip latches within 20 s by docs/background/heat.md, or has as thin walls; steel never does.
 
-Good conductors diverge by the paper's formula."""
+By the paper's formula good conductors diverge.
+"""
 
 
 def heat_of(setting: Setting, heat: Mapping[str, Any], density: float) -> dict[str, Any]:
@@ -82,33 +83,29 @@ def heat_of(setting: Setting, heat: Mapping[str, Any], density: float) -> dict[s
 
     Args:
         setting: The setting.
-        heat: Those of bin.yaml.
-        density: Of what the fingers are made of [kg/m³].
+        heat: The fields in bin.yaml.
+        density: Density of the fingers' material [kg/m³].
     """
     material = {"like": LIKE[setting.conductivity], "conductivity": setting.conductivity, "emissivity": setting.emissivity}
-    own = dict(heat) | {"material": material, "source": {"flux": setting.flux, "face": "-z"}}
+    fields = dict(heat) | {"material": material, "source": {"flux": setting.flux, "face": "-z"}}
     if setting.model == "physics":
-        own["material"] = material | {"density": WALL * density}
-        return own
-    del own["convection"]
-    return own | {"model": "paper", "contact_area": PAPERS_AREA}
+        fields["material"] = material | {"density": WALL * density}
+        return fields
+    del fields["convection"]
+    return fields | {"model": "paper", "contact_area": PAPERS_AREA}
 
 
 def documents(folder: Path) -> list[Path]:
-    """Write a task and its sensors' document for each setting; return the tasks' files.
-
-    Raises:
-        FileError: If one cannot be written.
-    """
+    """Write a task and its sensors' document for each setting; return the tasks' files."""
     task, sensors = (YAML(typ="safe").load(TASKS / name) for name in ("hot_ball.yaml", "bin.yaml"))
     sensors["scene"] = {"model": str(TASKS / "bin.xml")}
     contents, files = {}, []
     for setting in SETTINGS:
         density = MATERIALS[LIKE[setting.conductivity]].density
         heat = heat_of(setting, sensors["sensors"]["heat"], density)
-        own = sensors | {"sensors": sensors["sensors"] | {"heat": heat}}
+        document = sensors | {"sensors": sensors["sensors"] | {"heat": heat}}
         files.append(folder / f"{setting.name}.yaml")
-        contents[folder / f"{setting.name}_sensors.yaml"] = _yaml(own)
+        contents[folder / f"{setting.name}_sensors.yaml"] = _yaml(document)
         contents[files[-1]] = _yaml(task | {"document": f"{setting.name}_sensors.yaml"})
     with_folder(files[0])
     atomic_write_all(contents)
@@ -116,39 +113,26 @@ def documents(folder: Path) -> list[Path]:
 
 
 def table(folder: Path) -> str:
-    """Return a table in Markdown, with a row for each setting whose evaluation is in a folder.
+    """Return a Markdown table with a row for each setting whose evaluation is in a folder.
 
     Raises:
-        TgdslError: If there is none, or one is of another task.
+        TgdslError: If there is no evaluation, or one of another task.
     """
     lines = ["| by | k [W/(m·K)] | ε | S [s], of 20 | 95 % | episodes | the paper's hand |", "|" + "---|" * 7]
     for setting in SETTINGS:
         file = folder / f"{setting.name}.json"
         if not file.is_file():
             continue
-        try:
-            found = json.loads(file.read_text())
-        except ValueError as error:
-            raise TgdslError(f"{file}: {error}; expected a file of tgdsl evaluate --out") from error
-        if found.get("task") != "hot_ball":
-            raise TgdslError(f'{file}: an evaluation in "{found.get("task")}", expected one in "hot_ball"')
-        if missing := {"score", "score_interval", "episodes"} - found.keys():
-            raise TgdslError(f"{file}: there is no {min(missing)}: this is not what tgdsl evaluate --out wrote")
-        own = "physics, thin walls" if setting.model == "physics" else "the paper's formula"
-        mark, ends = "✓" if setting.is_found_by_the_paper else "–", found["score_interval"]
-        bounds = "–" if None in ends else "{:.2f} to {:.2f}".format(*ends)  # of one episode there is none
-        cells = (
-            own,
-            f"{setting.conductivity:g}",
-            f"{setting.emissivity:g}",
-            f"{found['score']:.2f}",
-            bounds,
-            found["episodes"],
-            mark,
-        )
-        lines.append(f"| {' | '.join(map(str, cells))} |")
+        evaluation = json.loads(file.read_text())
+        if evaluation["task"] != "hot_ball":
+            raise TgdslError(f'{file}: an evaluation in "{evaluation["task"]}", expected one in "hot_ball"')
+        model = "physics, thin walls" if setting.model == "physics" else "the paper's formula"
+        verdict, interval = "✓" if setting.is_found_by_the_paper else "–", evaluation["score_interval"]
+        bounds = "–" if None in interval else "{:.2f} to {:.2f}".format(*interval)  # none for a single episode
+        cells = f"{model} | {setting.conductivity:g} | {setting.emissivity:g} | {evaluation['score']:.2f} | {bounds}"
+        lines.append(f"| {cells} | {evaluation['episodes']} | {verdict} |")
     if len(lines) == 2:
-        raise TgdslError(f"{folder}: there is no evaluation of {', '.join(own.name for own in SETTINGS)}")
+        raise TgdslError(f"{folder}: there is no evaluation of {', '.join(setting.name for setting in SETTINGS)}")
     return "\n".join(lines)
 
 
@@ -159,13 +143,12 @@ def _yaml(value: dict[str, Any]) -> bytes:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("documents", "table"))
+    parser.add_argument("command", choices=("documents", "table"))
     parser.add_argument("folder", type=Path)
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     try:
-        print("\n".join(map(str, documents(given.folder))) if given.what == "documents" else table(given.folder))
+        print("\n".join(map(str, documents(options.folder))) if options.command == "documents" else table(options.folder))
     except TgdslError as error:
         print(error, file=sys.stderr)
         sys.exit(2)

@@ -1,14 +1,14 @@
-"""What touch costs in mjlab: time of a control step of an environment with the sensor, and of the same one without.
+"""Measure the cost of touch in mjlab: the time of a control step of environments with and without the sensor.
 
-    python benchmarks/mjlab_cost.py --device cuda:0 --envs 8192   # mjlab captures its physics steps by itself
+    python benchmarks/mjlab_cost.py --device cuda:0 --envs 8192   # mjlab captures its physics steps itself
     python benchmarks/mjlab_cost.py --device cpu --envs 16
 
-Needs tgdsl and mjlab, and no network: `pip install --no-index --find-links WHEELS tgdsl mjlab`. The scene is that of the task
-Tgdsl-In-Palm-Rotate, an XHand1 with 199 taxels of `kinematic_taxel` and a cube. The share is (with − without) / with, by the
+Needs tgdsl and mjlab, but no network: `pip install --no-index --find-links WHEELS tgdsl mjlab`. The scene is that of the task
+Tgdsl-In-Palm-Rotate: an XHand1 with 199 taxels of `kinematic_taxel` and a cube. The share is (with − without) / with, from
 medians of alternating blocks of steps.
 
-- `eager`: `TouchSensorCfg(graph=False)`, the module as it is
-- `graph`: `TouchSensorCfg()`, on a GPU: the module compiled, and replayed with the reading of the scene as one CUDA graph
+- `eager`: `TouchSensorCfg(graph=False)`, the module uncompiled
+- `graph`: `TouchSensorCfg()` on a GPU: the compiled module, replayed with the reading of the scene in one CUDA graph
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import torch
 
 
 def environment(num_envs: int, device: str, touch: str | None):
-    """Return environments of the task that begin alike, with a kind of touch or without; nothing ends or resets them."""
+    """Return environments of the task from the same seed, with "eager" or "graph" touch or without; nothing resets them."""
     from mjlab.envs import ManagerBasedRlEnv  # pyright: ignore[reportMissingImports]
 
     from tgdsl.adapters.mjlab_tasks import env_cfg
@@ -61,17 +61,17 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=50, help="control steps of a block")
     parser.add_argument("--blocks", type=int, default=5)
     options = parser.parse_args()
-    without = environment(options.envs, options.device, None)
+    bare = environment(options.envs, options.device, None)
     rows: dict[str, dict[str, float]] = {}
     for touch in ("eager", "graph") if torch.device(options.device).type == "cuda" else ("eager",):
-        touched = environment(options.envs, options.device, touch)
-        for env in (without, touched):
+        with_sensor = environment(options.envs, options.device, touch)
+        for env in (bare, with_sensor):
             seconds_per_step(env, max(5, options.steps // 5))
-        blocks = [[seconds_per_step(env, options.steps) for env in (without, touched)] for _ in range(options.blocks)]
+        blocks = [[seconds_per_step(env, options.steps) for env in (bare, with_sensor)] for _ in range(options.blocks)]
         plain, with_touch = (statistics.median(column) for column in zip(*blocks, strict=True))
-        rows[touch] = {"without_ms": 1e3 * plain, "with_ms": 1e3 * with_touch, "share": (with_touch - plain) / with_touch}
-    num_taxels = touched.scene["touch"].touch.plan.layout.num_taxels
-    print(f"{options.envs} environments, {num_taxels} taxels, {options.device}, control step {touched.step_dt:g} s")
+        rows[touch] = {"without_ms": 1e3 * plain, "with_ms": 1e3 * with_touch, "share": 1 - plain / with_touch}
+    num_taxels = with_sensor.scene["touch"].touch.plan.layout.num_taxels
+    print(f"{options.envs} environments, {num_taxels} taxels, {options.device}, control step {with_sensor.step_dt:g} s")
     for name, row in rows.items():
         print(f"{name:<10}{row['without_ms']:9.3f} ms without{row['with_ms']:9.3f} ms with   share {row['share']:.1%}")
     print(json.dumps({"envs": options.envs, "taxels": num_taxels, "device": options.device, "rows": rows}))

@@ -1,12 +1,12 @@
-"""Sensors fitted to recordings of real ones, and to a finite-element model: the tables and plots of docs/background/reality.md.
+"""Fit sensors to recordings of real ones and to a finite-element model: the tables and plots of docs/background/reality.md.
 
     python benchmarks/reality.py gelsight DATA_FOLDER [--out docs/images]
     python benchmarks/reality.py eflesh DATA_FOLDER
     python benchmarks/reality.py dome DATA_FOLDER
 
-The data are not part of tgdsl. `gelsight/subpixel.npz` (FOTS, places of markers found again from its images), `eflesh/normal`
-(eFlesh) and `gel_dome_fem.npz` (Taxim) are expected in DATA_FOLDER. Each row is one call of `tgdsl.calibrate` with the document
-and the recordings that this script writes into a temporary folder.
+The data are not part of tgdsl. DATA_FOLDER must have `gelsight/subpixel.npz` (FOTS; positions of markers detected again in its
+images), `eflesh/normal` (eFlesh) and `gel_dome_fem.npz` (Taxim). Each row is a call of `tgdsl.calibrate` with a document and
+recordings that this script writes to a temporary folder.
 """
 
 from __future__ import annotations
@@ -28,28 +28,28 @@ from tgdsl.calibration.problem import ReadingMap
 PX = 18.8e3
 """Pixels per metre of the GelSight's images, from the marker pitch."""
 CENTRE = np.array([137.0, 126.0])
-"""Middle of its contact [px]."""
+"""Centre of the contact [px]."""
 BALL = 3e-3
-"""Radius of the ball that presses it [m]."""
+"""Radius of the pressing ball [m]."""
 LAYER = {"kernel": "bonded_layer", "youngs_modulus": 1e5, "normal_stiffness": 1e7, "thickness": 7e-3, "poissons_ratio": 0.38}
 LAYER |= {"marker_depth": 3e-4}
 HALF_SPACE = {"kernel": "half_space", "youngs_modulus": 1e5, "normal_stiffness": 1e7, "poissons_ratio": 0.45}
 GAUSSIAN = {"kernel": "gaussian", "dilation_falloff": 8e4, "shear_falloff": 8e4}
 PRESSED = {**LAYER, "thickness": 6.85e-3, "poissons_ratio": 0.374, "marker_depth": 3.4e-4}
-"""The layer as fitted to the press alone."""
+"""The layer fitted to the press alone."""
 OF_LAYER = ["skin.thickness=2 mm:20 mm", "skin.poissons_ratio", "skin.marker_depth=0 mm:2 mm"]
 OF_HALF_SPACE = ["skin.poissons_ratio", "skin.marker_depth=0 mm:2 mm"]
 FRICTION = "skin.friction=0.02:3"
 DOME_RADIUS = 28.41e-3
-"""Radius of the sphere that the dome's nodes lie on, within 1 µm [m]."""
+"""Radius of the sphere on which the dome's nodes lie, within 1 µm [m]."""
 DOME_BALL = 1e-3
-"""Radius of the ball that stands for the load on its node [m]."""
+"""Radius of the ball that replaces the load on a node [m]."""
 DRAG_STARTS = ((0.0, 0.0), (1.5e-4, 5e-5), (1.5e-4, 9e-5))
-"""Where the search for the dragged ball starts, from the loaded node [m]: its place has several minima."""
+"""Starts of the search for the dragged ball's position, from the loaded node [m]: there are several minima."""
 DOME_NEAR = 1.5e-3
-"""Distance from that node up to which all nodes are used [m]."""
+"""Distance from the loaded node within which all nodes are used [m]."""
 DOME_SHARE = 0.03
-"""Share of the other nodes, with as much more weight."""
+"""Sampled share of the other nodes, whose weights make up for it."""
 
 
 def write_document(
@@ -58,10 +58,10 @@ def write_document(
     """Write a ball over a box whose upper face is the plane z = 0, and a document with one sensor on the box.
 
     Args:
-        folder: Where the files go.
+        folder: Folder of the files.
         name: Name of the sensor and the document.
-        sensor: The sensor.
-        resolutions: The box's taxels by resolution; the sensor has the first.
+        sensor: Fields of the sensor.
+        resolutions: The box's taxels by resolution; the sensor uses the first.
         pad: Half the box's width [m].
         ball: Radius of the ball [m].
 
@@ -97,30 +97,30 @@ def skin_document(
 
 
 def probe_document(folder: Path, law: dict[str, Any]) -> Path:
-    """Write one probe under a ball, whose force is the load; return the document."""
+    """Write a probe under a ball, whose force is the load; return the document."""
     probe = {"pos": [0, 0, 0], "normal": [0, 0, 1], "radius": 0.014}
     sensor = {"kind": "kinematic_taxel", "outputs": ["force"], "normal_stiffness": 1e4, "depth_exponent": 1.5}
     sensor |= {"normal_damping": 0, "shear_damping": 0, **law}
     return write_document(folder, "load", sensor, {"r": {"pad": {"method": "points", "points": [probe]}}}, 0.02, 0.02)
 
 
-def poses(*places: tuple[float, float, float]) -> dict[str, Any]:
-    """Return poses of pad and ball at each step, the ball's as given [m]."""
-    pos, quat = np.zeros((len(places), 2, 3)), np.zeros((len(places), 2, 4))
-    pos[:, 1], quat[..., 0] = places, 1.0
-    return {"time": np.arange(len(places)), "body_pos": pos, "body_quat": quat, "bodies": ["pad", "ball"]}
+def poses(*positions: tuple[float, float, float]) -> dict[str, Any]:
+    """Return poses of pad and ball at each step, with the ball's positions [m]."""
+    pos, quat = np.zeros((len(positions), 2, 3)), np.zeros((len(positions), 2, 4))
+    pos[:, 1], quat[..., 0] = positions, 1.0
+    return {"time": np.arange(len(positions)), "body_pos": pos, "body_quat": quat, "bodies": ["pad", "ball"]}
 
 
-def target(time_s: list[float], value: np.ndarray, kept: np.ndarray, floor: float) -> dict[str, Any]:
-    """Return a target of in-plane displacements [m] of the markers that were kept."""
+def target(time_s: list[float], value: np.ndarray, is_used: np.ndarray, floor: float) -> dict[str, Any]:
+    """Return a target of in-plane displacements [m] of the used markers."""
     return {
-        "target:skin": value[None], "clock:skin": time_s, "unit:skin": "m", "weight:skin": kept[None, :, None].astype(float),
+        "target:skin": value[None], "clock:skin": time_s, "unit:skin": "m", "weight:skin": is_used[None, :, None].astype(float),
         "channels:skin": ["displacement_x", "displacement_y"], "floor:skin": floor,
     }  # fmt: skip
 
 
 def gelsight_recordings(data: Path, folder: Path) -> np.ndarray:
-    """Write press.npz, drag.npz and raw.npz; return the unloaded places of the markers [m]."""
+    """Write press.npz, drag.npz and raw.npz; return the unloaded positions of the markers [m]."""
     markers = np.load(data / "gelsight" / "subpixel.npz")
     press, drag = markers["press"] / PX, markers["drag"] / PX
     deep, wide = BALL - 1e-3, np.array([4e-4, 4e-4, 4e-4])
@@ -147,7 +147,7 @@ def gelsight_recordings(data: Path, folder: Path) -> np.ndarray:
 def fit_case(
     label: str, sheet: Path, recordings: Any, parameters: list[str], out: Path | None, prefix: str = "", **options: Any
 ) -> Fit:
-    """Fit, print the fit and its duration, and draw it if there is a folder for pictures."""
+    """Fit, print the fit and its duration, and draw it if `out` is a folder."""
     start = time.perf_counter()
     result = tgdsl.calibrate(sheet, recordings, parameters, intervals="none", **options)
     print(f"{label}: {time.perf_counter() - start:.0f} s\n\n{result}\n", flush=True)
@@ -156,7 +156,7 @@ def fit_case(
     return result
 
 
-def gelsight(data: Path, out: Path | None, only: str, starts: int) -> None:
+def gelsight(data: Path, out: Path | None, starts: int) -> None:
     """Print the table of the GelSight's press and drag."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -177,15 +177,14 @@ def gelsight(data: Path, out: Path | None, only: str, starts: int) -> None:
         ]  # fmt: skip
         normals, fits = np.tile([0.0, 0.0, 1.0], (len(places), 1)), dict[str, Fit]()
         for label, skin, recordings, fit, reading in cases:
-            if only in label:
-                sheet = skin_document(folder, places, normals, skin, BALL, 4e-3, 0.4e-3)
-                options = {"reading": reading, "gain": True, "hold_out": "taxel", "starts": starts}
-                fits[label] = fit_case(label, sheet, recordings, fit, out, **options)
+            sheet = skin_document(folder, places, normals, skin, BALL, 4e-3, 0.4e-3)
+            options = {"reading": reading, "gain": True, "hold_out": "taxel", "starts": starts}
+            fits[label] = fit_case(label, sheet, recordings, fit, out, **options)
         print(Comparison(fits))
 
 
 def dome_recordings(data: Path, folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Write press.npz and drag.npz; return places [m] and normals of the nodes used: all near the load, some beyond."""
+    """Write press.npz and drag.npz; return positions [m] and normals of the used nodes: all near the load, some beyond."""
     nodes = np.load(data / "gel_dome_fem.npz")
     out = np.array([1.0, -1.0, -1.0])  # from the file's axes, z into the gel, to z out of it
     pos = nodes["dz_pos"].astype(np.float64)
@@ -197,10 +196,10 @@ def dome_recordings(data: Path, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     is_near = np.linalg.norm(pos - loaded, axis=1) < DOME_NEAR
     used = is_near | (np.random.default_rng(0).random(len(pos)) < DOME_SHARE)
     weight = np.where(is_near[used], 1.0, (~is_near).sum() / (used & ~is_near).sum())
-    # First the ball is pressed, so that the gel sticks to it, then it is where it is fitted to be: moved along the gel too.
-    down, apart = [loaded[0], loaded[1], DOME_BALL - 2.5e-4], np.array([1e-4, 1e-4, 3e-5])
+    # First the ball presses, so that the gel sticks to it. Then it moves to the fitted position, along the gel too.
+    down, width = [loaded[0], loaded[1], DOME_BALL - 2.5e-4], np.array([1e-4, 1e-4, 3e-5])
     moved = np.zeros((2, 2, 3))
-    moved[0, 1], moved[1, 1] = apart * [1, 1, 0], apart
+    moved[0, 1], moved[1, 1] = width * [1, 1, 0], width
     cases = {"press": (press, (0.0, 0.0)), **{f"drag{i}": (drag, start) for i, start in enumerate(DRAG_STARTS)}}
     for name, (value, (x, y)) in cases.items():
         first = (down[0] + x / 2, down[1] + y / 2, down[2])
@@ -213,8 +212,8 @@ def dome_recordings(data: Path, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     return pos[used], normal[used]
 
 
-def dome(data: Path, out: Path | None, only: str, starts: int) -> None:
-    """Print the table of the finite-element dome: its material from the press, which then predicts the drag."""
+def dome(data: Path, out: Path | None, starts: int) -> None:
+    """Print the table of the finite-element dome: the material fitted to the press predicts the drag."""
     with tempfile.TemporaryDirectory() as name:
         folder, fits = Path(name), dict[str, Fit]()
         places, normals = dome_recordings(data, folder)
@@ -229,8 +228,6 @@ def dome(data: Path, out: Path | None, only: str, starts: int) -> None:
             "layer": (layer, [poisson, depth, thickness]),
         }
         for kernel, (skin, material) in cases.items():
-            if only not in kernel:
-                continue
             sheet = skin_document(folder, places, normals, {**skin, "enter": 0}, DOME_BALL, 4.5e-4, 9e-5)
             options = {"prefix": "dome-", "gain": True, "starts": starts}
             press = fit_case(f"{kernel}, press", sheet, folder / "press.npz", material, out, hold_out="blocks", **options)
@@ -243,14 +240,14 @@ def dome(data: Path, out: Path | None, only: str, starts: int) -> None:
 
 
 def eflesh_recording(data: Path, run: str, contact: float, every: int, cycles: slice = slice(None)) -> dict[str, Any]:
-    """Return the recording of a run: its load [N] by the robot's height, every so many valid samples, of some of ten cycles.
+    """Return the recording of a run: its load [N] by the robot's height.
 
     Args:
         data: The data folder.
         run: `normal` or `shear`.
-        contact: Height of the first contact below the robot's highest pose, roughly [m].
-        every: One sample of so many is used.
-        cycles: Which of the ten.
+        contact: Approximate depth of the first contact below the robot's highest pose [m].
+        every: Step between the used samples.
+        cycles: The used cycles of the ten.
     """
     with lzma.open(data / "eflesh" / run / "states.csv.xz") as file:
         states = np.genfromtxt(file, delimiter=",")
@@ -265,8 +262,8 @@ def eflesh_recording(data: Path, run: str, contact: float, every: int, cycles: s
     }  # fmt: skip
 
 
-def eflesh(data: Path, out: Path | None, only: str, starts: int) -> None:
-    """Print the table of the eFlesh under a probe: its load by the robot's pose."""
+def eflesh(data: Path, out: Path | None, starts: int) -> None:
+    """Print the table of the eFlesh under a probe: the load by the robot's pose."""
     stiffness, exponent = "load.normal_stiffness=1e1:1e8", "load.depth_exponent=0.05:4"
     lattice = {"densification": 0.03, "depth_exponent": 0.3, "normal_stiffness": 30}
     loop, of_loop = {"force": 1.5, "width": 2e-3}, ["load.loop.force=0.1:10", "load.loop.width=0.1 mm:10 mm"]
@@ -284,10 +281,9 @@ def eflesh(data: Path, out: Path | None, only: str, starts: int) -> None:
     with tempfile.TemporaryDirectory() as name:
         fits: dict[str, Fit] = {}
         for label, (law, recordings, fit, gain) in cases.items():
-            if only in label:
-                sheet = probe_document(Path(name), law)
-                options = {"prefix": "eflesh-", "gain": gain, "hold_out": "time", "folds": 10, "starts": starts}
-                fits[label] = fit_case(label, sheet, recordings, fit, out, **options)
+            sheet = probe_document(Path(name), law)
+            options = {"prefix": "eflesh-", "gain": gain, "hold_out": "time", "folds": 10, "starts": starts}
+            fits[label] = fit_case(label, sheet, recordings, fit, out, **options)
         print(Comparison(fits))
 
 
@@ -295,11 +291,10 @@ def main(
     which: Annotated[Literal["gelsight", "eflesh", "dome"], tyro.conf.arg(help="The data.")],
     data: Path,
     out: Path | None = None,
-    only: str = "",
     starts: int = 1,
 ) -> None:
     """Fit sensors to recordings and print the errors."""
-    {"gelsight": gelsight, "eflesh": eflesh, "dome": dome}[which](data, out, only, starts)
+    {"gelsight": gelsight, "eflesh": eflesh, "dome": dome}[which](data, out, starts)
 
 
 if __name__ == "__main__":

@@ -1,15 +1,15 @@
-"""What draws `poisson` layouts: our lattice, pymeshlab's filters as pools of candidates, and its Poisson-disk filter alone.
+"""Compare samplers of `poisson` layouts: the lattice, pymeshlab's filters as pools of candidates, and its Poisson-disk filter.
 
     python benchmarks/samplers.py
 
 On each colliding link of both right hands, 4 taxels per cm² of its outer surface:
 
-- `gap`: largest distance of the surface from the nearest taxel, over the radius of 4 mm; mean and largest of the links;
-- `CV`: standard deviation over mean of the distances of nearest neighbours, mean of the links;
-- `normals`: share of taxels whose normal is more than 5° off the surface's;
-- `count`: least and largest number of taxels, over the number wanted;
-- `rows`: share of taxels that stay in place, within 2 µm, if the mesh is saved again: vertices renumbered, faces reordered;
-- `time`: of a hand [s].
+- `gap`: largest distance of the surface from the nearest taxel, over the radius of 4 mm; mean and maximum over links;
+- `CV`: standard deviation over mean of the distances of nearest neighbours, mean over links;
+- `normals`: share of taxels whose normal differs from the surface's by more than 5°;
+- `count`: least and greatest number of taxels, over the requested number;
+- `rows`: share of taxels that stay in place, within 2 µm, when vertices are renumbered and faces reordered;
+- `time`: time of a hand [s].
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ Sampled = tuple[np.ndarray, np.ndarray]
 
 
 def from_pool(sampler: str) -> Callable[[Shell, int], Sampled]:
-    """Return taxels chosen from a pool, and their normals."""
+    """Return a sampler that chooses taxels from a pool; it returns positions and normals."""
 
     def taxels(shell: Shell, count: int) -> Sampled:
         pool = poisson.pool(shell, EVERYWHERE, 0, count, None, sampler)
         assert pool is not None
-        chosen = poisson.choose(pool, count, None)
-        return pool.pos[chosen], pool.normal[chosen]
+        indices = poisson.choose(pool, count, None)
+        return pool.pos[indices], pool.normal[indices]
 
     return taxels
 
 
 def poisson_disk(shell: Shell, count: int) -> Sampled:
-    """Return samples of pymeshlab's Poisson-disk filter, as near to a count as it comes."""
+    """Return samples of pymeshlab's Poisson-disk filter, about as many as requested."""
     meshes = pymeshlab.MeshSet()
     meshes.add_mesh(pymeshlab.Mesh(shell.surface.vertices, shell.surface.faces))
     meshes.generate_sampling_poisson_disk(samplenum=count, exactnumflag=True)
@@ -60,7 +60,7 @@ def poisson_disk(shell: Shell, count: int) -> Sampled:
 SAMPLERS = {"lattice": from_pool("lattice"), "pymeshlab": from_pool("pymeshlab"), "poisson_disk": poisson_disk}
 
 
-def resaved(surface: Surface) -> Surface:
+def renumbered(surface: Surface) -> Surface:
     """Return a surface with its vertices renumbered and its faces reordered."""
     draw = np.random.default_rng(0)
     number, order = draw.permutation(len(surface.vertices)), draw.permutation(len(surface.faces))
@@ -68,8 +68,8 @@ def resaved(surface: Surface) -> Surface:
     return Surface(surface.vertices[number], faces, surface.face_geom[order], surface.geoms)
 
 
-def measured(surface: Surface, name: str) -> tuple[float, ...] | None:
-    """Return the columns of one link, or nothing if none of it is outside."""
+def measure(surface: Surface, name: str) -> tuple[float, ...] | None:
+    """Return the columns of a link, or None if it has no outer surface."""
     shell = outer_shell(surface)
     everywhere = poisson.pool(shell, EVERYWHERE, 1, 400, None)
     if everywhere is None:
@@ -79,22 +79,21 @@ def measured(surface: Surface, name: str) -> tuple[float, ...] | None:
     pos, normal = SAMPLERS[name](shell, count)
     seconds = time.perf_counter() - start
     _, face, _ = igl.point_mesh_squared_distance(pos, shell.surface.vertices, shell.surface.faces)[:3]
-    off = (normal * shell.surface.face_normals[np.ravel(face)]).sum(axis=1) < np.cos(np.radians(5))
+    is_off = (normal * shell.surface.face_normals[np.ravel(face)]).sum(axis=1) < np.cos(np.radians(5))
     gap = KDTree(pos).query(everywhere.pos)[0].max() / RADIUS
     nearest = KDTree(pos).query(pos, k=2)[0][:, 1]
-    again, _ = SAMPLERS[name](outer_shell(resaved(surface)), count)
-    stays = (KDTree(again).query(pos)[0] < 2e-6).mean()
-    return gap, nearest.std() / nearest.mean(), off.mean(), len(pos) / count, stays, seconds
+    pos_renumbered, _ = SAMPLERS[name](outer_shell(renumbered(surface)), count)
+    stays = (KDTree(pos_renumbered).query(pos)[0] < 2e-6).mean()
+    return gap, nearest.std() / nearest.mean(), is_off.mean(), len(pos) / count, stays, seconds
 
 
 def main() -> None:
-    """Print the table."""
     print("| hand | sampler | gap | CV | normals | count | rows | time |\n|---|---|---|---|---|---|---|---|")
     for hand in ("xhand1", "sharpa"):
         model = load_model(Path(__file__).parents[1] / "robots" / hand / f"{hand}_right.xml")
         surfaces = [model.surface(geoms) for body in model.bodies[1:] if (geoms := model.touchable(body))]
         for name in SAMPLERS:
-            gap, cv, off, count, stays, seconds = np.array([row for s in surfaces if (row := measured(s, name))]).T
+            gap, cv, off, count, stays, seconds = np.array([row for s in surfaces if (row := measure(s, name))]).T
             spread = f"{gap.mean():.2f}, {gap.max():.2f} | {cv.mean():.3f} | {off.mean():.0%}"
             counts = f"{count.min():.2f} to {count.max():.2f} | {stays.mean():.0%} | {seconds.sum():.1f}"
             print(f"| {hand} | `{name}` | {spread} | {counts} |")

@@ -1,9 +1,10 @@
-"""Keep what policies scored while they learned, and draw it by wall-clock and by samples.
+"""Draw the scores of policies while they learned by wall-clock time and by samples, from docs/measured/train.
 
-python benchmarks/training_curves.py [--out docs/images/training_curves.png]          # draw what is kept
-python benchmarks/training_curves.py --keep out/screwdriver --name screwdriver/s1    # keep a run's curve first
+python benchmarks/training_curves.py [--out docs/images/training_curves.png]          # draw
+python benchmarks/training_curves.py --keep out/screwdriver --name screwdriver/s1    # first store a run's curve
 
-Of a run's curve.csv `ROWS` rows are kept: means of as many iterations each, of episodes' values those over their episodes.
+A run's curve.csv is stored in at most `ROWS` rows: means over equal numbers of iterations; episodes' values are means over
+episodes.
 """
 
 from __future__ import annotations
@@ -53,14 +54,14 @@ PANELS: dict[str, dict[str, str]] = {
     "in_hand_repose: goals in a row": {"repose/r1": "r1", "repose/xy": "about x and y: by 20°, 35°, then 45°"},
     "grip_force: RMS of force error over command": {"grip_force/x": "x", "grip_force/x_again": "x again"},
 }
-"""Titles, and the runs by file and label."""
+"""Titles of the panels, and files and labels of their runs."""
 ROWS = 64
-"""Rows of a curve that are kept, at most."""
+"""Largest number of rows of a stored curve."""
 COLUMNS = ("iteration", "samples", "seconds", "Episode/return", "Episode/score", "Episode/dropped", "Reward/spin",
            "Policy/mean_std", "Loss/learning_rate", "Loss/rnd", "rollout", "update")  # fmt: skip
-"""What is kept of an iteration, if it is there."""
+"""Stored columns, where a run has them."""
 WINDOW = 5
-"""Rows of a curve that a point is the mean of."""
+"""Rows of a curve whose mean is drawn as a point."""
 
 
 def curve(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -74,11 +75,11 @@ def curve(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def keep(run: Path, name: str) -> Path:
-    """Write a thinned copy of a run's curve; return its file.
+    """Store a thinned copy of a run's curve; return its file.
 
     Raises:
         OSError: If there is no curve; nothing is written.
-        TgdslError: If a column is missing; the same.
+        TgdslError: If a column is missing; nothing is written.
     """
     file = run / "curve.csv"
     with file.open(newline="") as lines:
@@ -91,18 +92,18 @@ def keep(run: Path, name: str) -> Path:
     writer.writerow(names)
     for first in range(0, len(rows), size):
         writer.writerow([_mean(rows[first : first + size], column) for column in names])
-    found = with_folder(KEPT / f"{name}.csv")
-    atomic_write(found, text.getvalue().encode())
-    return found
+    stored = with_folder(KEPT / f"{name}.csv")
+    atomic_write(stored, text.getvalue().encode())
+    return stored
 
 
 def _mean(rows: list[dict[str, str]], column: str) -> str:
-    """Return a column's mean, of what is of episodes that over their episodes; what counts on is that of the last row."""
+    """Return a column's mean, for values of episodes over episodes; for counters the last row's value."""
     if column in ("iteration", "samples", "seconds"):
         return f"{float(rows[-1][column]):.5g}" if column != "iteration" else rows[-1][column]
     weights = [float(row["episodes"]) if column.startswith(("Episode/", "Reward/")) else 1.0 for row in rows]
-    told = [(float(row[column]), weight) for row, weight in zip(rows, weights, strict=True) if row[column] and weight]
-    return f"{sum(value * weight for value, weight in told) / sum(weight for _, weight in told):.5g}" if told else ""
+    pairs = [(float(row[column]), weight) for row, weight in zip(rows, weights, strict=True) if row[column] and weight]
+    return f"{sum(value * weight for value, weight in pairs) / sum(weight for _, weight in pairs):.5g}" if pairs else ""
 
 
 def panel(by_time: Axes, by_samples: Axes, title: str, runs: dict[str, str]) -> None:
@@ -121,10 +122,9 @@ def panel(by_time: Axes, by_samples: Axes, title: str, runs: dict[str, str]) -> 
 
 
 def main() -> None:
-    """Keep one if asked to, and draw them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="a run's folder")
-    parser.add_argument("--name", metavar="TASK/NAME", help="of the curve that is kept")
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="folder of a run whose curve is stored")
+    parser.add_argument("--name", metavar="TASK/NAME", help="name of the stored curve")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "images" / "training_curves.png")
     options = parser.parse_args()
     if (options.keep is None) != (options.name is None):
@@ -135,8 +135,7 @@ def main() -> None:
         except (OSError, TgdslError) as error:
             parser.error(str(error))
     figure = Figure(figsize=(10, 3 * len(PANELS)), dpi=100)
-    for (title, runs), pair in zip(PANELS.items(), figure.subplots(len(PANELS), 2), strict=True):
-        by_time, by_samples = pair
+    for (title, runs), (by_time, by_samples) in zip(PANELS.items(), figure.subplots(len(PANELS), 2), strict=True):
         panel(by_time, by_samples, title, runs)
     figure.tight_layout()
     FigureCanvasAgg(figure).print_png(str(options.out))

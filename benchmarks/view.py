@@ -1,6 +1,6 @@
-"""What a page costs a loop or a learner: steps with and without it, in blocks that alternate, with a browser connected.
+"""Measure the cost of a page for a loop or a learner: alternating blocks of steps with and without it, and a connected browser.
 
-The browser is a websocket that reads what the page sends and draws nothing.
+The browser is a websocket client that reads the page's messages and draws nothing.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ Opened = tuple[LoopPage, Callable[[], object], Callable[[], object]]
 
 @dataclass
 class ViewCost:
-    """Time a document's loop, bare and shown; or, of a task, the iterations of its learner."""
+    """Time the loop of a document, or the iterations of a task's learner, bare and shown."""
 
     document: tyro.conf.Positional[Path] = Path("examples/xhand1_palm.yaml")
     learner: bool = False
-    """The document is a task: time `tgdsl train --view`."""
+    """Time `tgdsl train --view`; the document is a task."""
     num_envs: int = 64
     device: str = "cpu"
-    """Device of a learner; a loop's is the CPU."""
+    """Device of a learner; a loop runs on the CPU."""
     threads: int = 0
     """CPU threads of a loop's physics; 0: one per CPU."""
     seconds: float = 2.0
-    """Length of a block, at least one step of the loop, or one iteration of the learner."""
+    """Length of a block, which has at least one step or iteration."""
     blocks: int = 9
     port: int = 8440
 
     def run(self) -> None:
-        """Print the ratio of the times of a step, shown over bare: median and quartiles over pairs of blocks."""
+        """Print the ratio of a step's times, shown over bare: median and quartiles over pairs of blocks."""
         with self._learner() if self.learner else self._loop() as (page, bare, shown):
             browser = subprocess.Popen([sys.executable, __file__, "browser", page.url.rpartition(":")[2]])
             self._block(bare)
@@ -107,7 +107,7 @@ class ViewCost:
         env.close()
 
     def _block(self, step: Callable[[], object]) -> tuple[float, float, float]:
-        """Return wall and CPU time of a step, and the time of all [s]."""
+        """Return wall and CPU time of a step, and the wall time of the block [s]."""
         begin, cpu, count = time.perf_counter(), time.process_time(), 0
         while time.perf_counter() - begin < self.seconds:
             step()
@@ -117,7 +117,7 @@ class ViewCost:
 
 
 async def browse(port: int) -> None:
-    """Read what a page sends until it ends."""
+    """Read the messages of a page until it closes."""
     import msgspec
     import viser
     import websockets
@@ -127,7 +127,7 @@ async def browse(port: int) -> None:
     camera |= {"position": (0, 0, 1), "look_at": (0, 0, 0), "up_direction": (0, 1, 0)}
     options = {"subprotocols": [f"viser-v{viser.__version__}"], "max_size": None, "compression": None}
     async with websockets.connect(f"ws://localhost:{port}", **options) as socket:
-        await socket.send(msgspec.msgpack.encode(camera))  # by which viser knows a browser
+        await socket.send(msgspec.msgpack.encode(camera))  # viser takes the client for a browser then
         with contextlib.suppress(websockets.ConnectionClosed):
             while True:
                 await socket.recv()

@@ -1,12 +1,11 @@
-"""Which fingertips could tell a ball of 45 °C from one of 22 °C within 20 s: the paper's table, by formula and by physics.
+"""Compute which fingertips tell a ball of 45 °C from one of 22 °C within 20 s, by the formula of the paper and by physics.
 
     python benchmarks/warm_fingertips.py --out docs/measured/warm_fingertips.json --plot docs/images/warm_fingertips.png
 
-A fingertip of the XHand1, 2 × 2 × 2 cells, begins at 22 °C and is pressed on the ball for 20 s. Of each conductivity,
-emissivity and heat made in it: when the warmest cell first reads 42.2 °C (the paper's latch), by `model: paper` and by physics,
-on balls of several materials, and with no ball at all, as its own heat may do. ρ and c are those of the material that the
-conductivity is named after, see `FINGERTIPS`. The paper says neither what its ball is made of nor a coefficient of convection:
-there is none.
+A fingertip of the XHand1 with 2 × 2 × 2 cells starts at 22 °C and presses the ball for 20 s. For each conductivity, emissivity
+and heating power, the table has the time at which the warmest cell first reads 42.2 °C (the paper's latch), by `model: paper`
+and by physics, on balls of several materials, and without a ball, since the heater alone may do it. ρ and c are those of the
+material in `FINGERTIPS`. The paper gives neither the ball's material nor a coefficient of convection; there is no convection.
 """
 
 from __future__ import annotations
@@ -22,27 +21,25 @@ from typing import Any, NamedTuple
 import torch
 
 import tgdsl
-from tgdsl.errors import TgdslError
 from tgdsl.fields.materials import MATERIALS
-from tgdsl.files.write import check_writable
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 
 LINK = "right_hand_mid_link2"
 FINGERTIPS = {1.0: "glass", 10.0: "stainless_steel", 100.0: "aluminium", 150.0: "aluminium"}
-"""Conductivities of the paper's table [W/(m·K)], and what else the fingertip is like."""
+"""Material with a fingertip's other properties, by the conductivities of the paper's table [W/(m·K)]."""
 EMISSIVITIES, FLUXES = (0.5, 0.85), (500.0, 5000.0)
 
 
 class Column(NamedTuple):
-    """What a fingertip is pressed on, and by whose physics.
+    """A column of the table: model of heat, ball, and fingertip.
 
     Attributes:
         model: "paper" or "physical".
-        ball: Material of the ball; "none" if there is none.
-        patch: What its area is called.
-        area: Area of the patch [m²]; None: that of the force.
-        solid: Share of the fingertip's box that is solid, the rest being hollow.
+        ball: Material of the ball; "none" without a ball.
+        patch: Name of the contact area.
+        area: Contact area [m²]; None: it follows from the force.
+        solid: Solid share of the fingertip's box.
     """
 
     model: str
@@ -63,13 +60,14 @@ COLUMNS = (
     Column("physical", "none"),
     Column("physical", "none", "thin walls", solid=0.1),
 )
-"""The paper's πδ is a number for an area."""
-LATCH, SECONDS = 42.2, 20.0
+"""The columns. The paper uses πδ, a length, as an area."""
+LATCH, SECONDS, FORCE, STEPS_PER_SECOND = 42.2, 20.0, 5.0, 40
+"""Reading that latches [°C]; duration [s]; normal force [N]; readings per second."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One fingertip on one ball: when it latched [s], None if never; readings every second [°C], None if no numbers."""
+    """A fingertip on a ball: time of the latch [s] or None; readings every second [°C], None where they diverge."""
 
     column: str
     conductivity: float
@@ -114,42 +112,42 @@ def module_of(column: Column, conductivity: float, emissivity: float, flux: floa
     )
 
 
-def pressed(module: TactileModule, force: float, dt: float) -> SceneState:
-    """Return the fingertip on the ball, at the middle of its pad, the face towards −x."""
+def pressed(module: TactileModule, force: float) -> SceneState:
+    """Return the state of a fingertip on the ball, at the centre of its pad, the face towards −x."""
     inputs, box = module.inputs, module.plan.quantities["patches"].uses[0].boxes[0].copy()
     zeros = torch.zeros(1, len(inputs.pairs), inputs.slots, 3, dtype=torch.float64)
     values: dict[str, Any] = {
         name: zeros.clone() for name in ("contact_pos", "contact_force", "contact_torque", "contact_normal")
     }
-    middle = torch.as_tensor(box).mean(dim=0)
-    middle[0] = box[0, 0]
-    values["contact_pos"][:, 0, 0], values["contact_normal"][:, 0, 0, 0] = middle, 1.0
+    centre = torch.as_tensor(box).mean(dim=0)
+    centre[0] = box[0, 0]
+    values["contact_pos"][:, 0, 0], values["contact_normal"][:, 0, 0, 0] = centre, 1.0
     values["contact_force"][:, 0, 0, 0] = force
     pose = torch.zeros(1, len(inputs.bodies), 3, dtype=torch.float64)
     quat = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(1, len(inputs.bodies), 4)
     net = values["contact_force"].sum(dim=2)
-    found = torch.ones(1, len(inputs.pairs))
-    return SceneState(body_pos=pose, body_quat=quat, contact_netforce=net, contact_found=found, dt=dt, **values)
+    count = torch.ones(1, len(inputs.pairs))
+    dt = 1 / STEPS_PER_SECOND
+    return SceneState(body_pos=pose, body_quat=quat, contact_netforce=net, contact_found=count, dt=dt, **values)
 
 
 def name_of(column: Column) -> str:
-    """Return what a column is called."""
+    """Return the heading of a column."""
     ball = "no ball" if column.ball == "none" else column.ball
     return ", ".join(part for part in (column.model, ball, column.patch) if part)
 
 
-def run(column: Column, k: float, emissivity: float, flux: float, force: float, dt: float) -> Run:
+def run(column: Column, k: float, emissivity: float, flux: float) -> Run:
     """Press a fingertip on a ball for 20 s."""
     module = module_of(column, k, emissivity, flux)
-    state, latched, curve = pressed(module, 0.0 if column.ball == "none" else force, dt), None, []
-    reading = 22.0
-    for step in range(round(SECONDS / dt) + 1):
+    state, latched, curve = pressed(module, 0.0 if column.ball == "none" else FORCE), None, []
+    for step in range(round(SECONDS * STEPS_PER_SECOND) + 1):
         reading = float(module(state)["heat"][0, 0, 0])
         if latched is None and reading >= LATCH:
-            latched = step * dt
-        if step % round(1.0 / dt) == 0:
+            latched = step / STEPS_PER_SECOND
+        if step % STEPS_PER_SECOND == 0:
             curve.append(_number(reading))
-    return Run(name_of(column), k, emissivity, flux, latched, _number(reading), curve)
+    return Run(name_of(column), k, emissivity, flux, latched, curve[-1], curve)
 
 
 def _number(reading: float) -> float | None:
@@ -157,21 +155,21 @@ def _number(reading: float) -> float | None:
 
 
 def table(runs: list[Run]) -> str:
-    """Return the table in Markdown: when each latched, and what it read at the end."""
+    """Return the Markdown table: time of the latch, and last reading."""
     names = [name_of(column) for column in COLUMNS]
     lines = ["| k [W/(m·K)] | ε | q [W/m²] | " + " | ".join(names) + " |", "|" + "---|" * (3 + len(names))]
     for k, e, q in itertools.product(FINGERTIPS, EMISSIVITIES, FLUXES):
         cells = []
         for name in names:
-            own = next(r for r in runs if (r.column, r.conductivity, r.emissivity, r.flux) == (name, k, e, q))
-            end = "diverges" if own.last is None or abs(own.last) >= 1e4 else f"{own.last:.1f} °C"
-            cells.append(end if own.latched is None else f"**{own.latched:.2f} s** ({end})")
+            result = next(r for r in runs if (r.column, r.conductivity, r.emissivity, r.flux) == (name, k, e, q))
+            end = "diverges" if result.last is None or abs(result.last) >= 1e4 else f"{result.last:.1f} °C"
+            cells.append(end if result.latched is None else f"**{result.latched:.2f} s** ({end})")
         lines.append(f"| {k:g} | {e:g} | {q:g} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
 def plot(runs: list[Run], file: Path) -> None:
-    """Draw the physics: readings over time, on balls and on none."""
+    """Draw the readings by physics over time, with and without a ball."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -182,8 +180,8 @@ def plot(runs: list[Run], file: Path) -> None:
     for ax, name in zip(axes, columns, strict=True):
         for colour, k in zip(("tab:gray", "tab:blue", "tab:orange", "tab:red"), FINGERTIPS, strict=True):
             for style, q in zip((":", "-"), FLUXES, strict=True):
-                own = next(r for r in runs if (r.column, r.conductivity, r.emissivity, r.flux) == (name, k, 0.5, q))
-                curve = [math.nan if reading is None else reading for reading in own.curve]
+                result = next(r for r in runs if (r.column, r.conductivity, r.emissivity, r.flux) == (name, k, 0.5, q))
+                curve = [math.nan if reading is None else reading for reading in result.curve]
                 ax.plot(range(len(curve)), curve, style, color=colour, label=f"k = {k:g}, q = {q:g}")
         ax.axhline(LATCH, color="black", lw=0.8)
         ax.set(title=name.removeprefix("physical, "), xlabel="time [s]")
@@ -193,27 +191,16 @@ def plot(runs: list[Run], file: Path) -> None:
 
 
 def main() -> None:
-    """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--force", type=float, default=5.0, help="normal force [N]")
-    parser.add_argument("--dt", type=float, default=0.025, help="time between readings [s]")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--plot", type=Path)
-    given = parser.parse_args()
-    if given.dt <= 0 or abs(round(1.0 / given.dt) * given.dt - 1.0) > 1e-9:
-        parser.error(f"--dt {given.dt}: expected a whole number of readings per second")
-    try:
-        for file in filter(None, (given.out, given.plot)):
-            check_writable(file)
-    except TgdslError as error:
-        parser.error(str(error))
-    cases = itertools.product(COLUMNS, FINGERTIPS, EMISSIVITIES, FLUXES)
-    runs = [run(*case, given.force, given.dt) for case in cases]
+    options = parser.parse_args()
+    runs = [run(*case) for case in itertools.product(COLUMNS, FINGERTIPS, EMISSIVITIES, FLUXES)]
     print(table(runs))
-    if given.out:
-        given.out.write_text(json.dumps([asdict(own) for own in runs], allow_nan=False) + "\n")
-    if given.plot:
-        plot(runs, given.plot)
+    if options.out:
+        options.out.write_text(json.dumps([asdict(result) for result in runs], allow_nan=False) + "\n")
+    if options.plot:
+        plot(runs, options.plot)
 
 
 if __name__ == "__main__":
