@@ -89,7 +89,7 @@ def test_from_a_teacher_to_students_that_play(base, here):
     assert float(rows[0]["score"]) == evaluation["depth-ends-clean-s0"]["score"]
     card = json.loads((folder / "default" / "students" / "depth-all-clean-s0.json").read_text())
     assert card["groups"] == {"proprio": 6, "tactile_sensors": 10, "goal": 7} and card["teacher"] == "teacher.pt"
-    assert len(card["gates"]) == 10 and all(0.9 < value < 1.0 for value in card["gates"]) and len(set(card["gates"])) > 1
+    assert len(card["gates"]) == 10 and all(1.0 < value < 2.5 for value in card["gates"]) and len(set(card["gates"])) > 1
     assert "gates" not in json.loads((folder / "default" / "students" / "none-s0.json").read_text())
     names = [{file.stem for file in (folder / "default" / "students").glob(f"*.{ending}")} for ending in ("pt", "onnx")]
     assert names[0] == names[1] and len(names[0]) == 5
@@ -115,7 +115,7 @@ def test_from_a_teacher_to_students_that_play(base, here):
 
 def test_the_layout_of_a_student_has_the_taxels_of_its_widest_gates(base, here):
     """A task with that layout sees just these taxels at `chosen`; its other groups of observations keep their sizes."""
-    gates = [0.2, 0.9, 0.0, 0.3, 1.0, 0.4, 0.0, 0.0, 0.0, 0.0]  # of six taxels on the finger, then four on its tip
+    gates = [-1.0, 2.0, -4.0, -0.5, 5.0, 0.3, -3.0, -3.5, -5.0, -6.0]  # log α of six taxels on the finger, four on its tip
     overrides = {"touch": "depth", "placement": "all"}
     task, seen = load_task(base / "task.yaml", overrides), ["proprio", "tactile_sensors"]
     student = teacher(base / "student.pt", task, seen, gates=gates, overrides=overrides, task=str(base / "task.yaml"))
@@ -136,7 +136,7 @@ def test_the_layout_of_a_student_has_the_taxels_of_its_widest_gates(base, here):
     for env in envs:
         env.close()
     refused = [
-        (("--taxels", "6"), "5 of 10 gates are open, not 6"),
+        (("--taxels", "11"), "11 of its 10 taxels; give --taxels from 1 to 10"),
         (("--taxels", "0"), "--taxels 0: expected at least 1"),
         (("-o", "new/chosen.yaml"), "new/chosen.yaml: this file is there already; give --force to replace it"),
     ]

@@ -22,14 +22,14 @@ def outputs_on_taxels(touch: TactileModule) -> list[Output]:
 def table(touch: TactileModule, readings: Mapping[str, Tensor], env: int = 0) -> list[str]:
     """Return the readings of one environment, link by link.
 
-    Each reading has one column: force as the magnitude of the link's summed force, contact as the number of taxels in contact,
-    any other channel or vector as the largest magnitude. Readings of bodies show the link's body. Readings with other rows,
-    such as one per inertial sensor, follow with a line for each row; readings of joints and actuators are left out.
+    Each reading has one column: force as the magnitude of the link's summed force, contact alone as the number of taxels in
+    contact, any other channel or vector as the largest magnitude. Readings of bodies show the link's body. Readings with other
+    rows, such as one per inertial sensor, follow with a line for each row; readings of joints and actuators are left out.
     """
     taxels = touch.taxels
     outputs = outputs_on_taxels(touch)
     links = list(dict.fromkeys(link for sensor in taxels.values() for link in sensor["link"]))
-    units = ["taxels" if output.channels == ("contact",) else output.units[0] for output in outputs]
+    units = ["taxels" if output.channels == ("contact",) else output.units[_first(output)] for output in outputs]
     header = ["link"] + [f"{output.name} [{unit}]" for output, unit in zip(outputs, units, strict=True)]
     rows = [[link] + [_cell(taxels[output.sensor], output, readings, link, env) for output in outputs] for link in links]
     lines = _aligned(header, rows) if outputs else []
@@ -71,6 +71,11 @@ def _aligned(header: list[str], rows: list[list[str]]) -> list[str]:
     return ["  ".join(row) for row in (header, ["─" * width for width in widths], *rows)]
 
 
+def _first(output: Output) -> int:
+    """Return the first channel that is shown: the force where there is one, as beside the contact bit of `link_contact`."""
+    return output.channels.index("force_x") if "force_x" in output.channels else 0
+
+
 def _cell(taxels: TaxelTable, output: Output, readings: Mapping[str, Tensor], link: str, env: int) -> str:
     is_on_link = taxels["link"] == link
     if not is_on_link.any():
@@ -79,8 +84,9 @@ def _cell(taxels: TaxelTable, output: Output, readings: Mapping[str, Tensor], li
     values = values[[output.bodies.index(taxels["body"][is_on_link][0])]] if output.rows == "body" else values[is_on_link]
     if output.channels == ("contact",):
         return f"{int(values.sum())}/{len(values)}"
-    if output.channels[:3] == ("force_x", "force_y", "force_z"):
-        return f"{np.linalg.norm(values[:, :3].sum(axis=0)):.3f}"
+    first = _first(output)
+    if output.channels[first] == "force_x":
+        return f"{np.linalg.norm(values[:, first : first + 3].sum(axis=0)):.3f}"
     is_vector = output.channels[0].endswith("_x")
     largest = np.linalg.norm(values[:, : 3 if is_vector else 1], axis=1).max()
     return f"{largest:.2e}" if largest > THRESHOLDS.get(output.units[0], 0.0) else "0"

@@ -55,12 +55,13 @@ class Gates(nn.Module):
         super().__init__()
         self.weight = nn.Parameter(torch.full((num_taxels,), INITIAL / SCALE))
 
-    def values(self, noise: Float[Tensor, " taxel"] | None = None) -> Float[Tensor, " taxel"]:
-        """Return z."""
-        return openings(SCALE * self.weight, noise)
+    @property
+    def log_alpha(self) -> Float[Tensor, " taxel"]:
+        """Openness of the gates: the wider, the larger."""
+        return SCALE * self.weight
 
     def forward(
         self, x: Float[Tensor, "env feature"], noise: Float[Tensor, " taxel"] | None = None
     ) -> Float[Tensor, "env feature"]:
         """Return the numbers of taxels, multiplied by their gates."""
-        return (x.unflatten(1, (-1, self.weight.shape[0])) * self.values(noise)).flatten(1)
+        return (x.unflatten(1, (-1, self.weight.shape[0])) * openings(self.log_alpha, noise)).flatten(1)

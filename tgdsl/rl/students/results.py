@@ -16,6 +16,7 @@ from statistics import fmean
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from scipy.stats import t as student_t
 
 from tgdsl.compiler.pipeline import all_layouts
@@ -28,6 +29,7 @@ from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.playing.evaluation import Evaluation
 from tgdsl.rl.playing.policy import PolicyError, PolicyFile, card_texts, check_card, write_onnx_policy, write_policy
 from tgdsl.rl.sensors import GROUP, PolicyTouch, compile_sensors
+from tgdsl.rl.students.gates import openings
 from tgdsl.rl.students.keys import StudentKey, own_task
 from tgdsl.rl.students.learner import Distiller
 from tgdsl.rl.students.student import acting, deployed
@@ -128,7 +130,7 @@ def write_students(
         card |= {"teacher": origin["teacher"], "score": evaluations[i].plain() if evaluations else None}
         network = acting(distiller.student(i))
         if network.student.gates is not None:
-            card["gates"] = network.student.gates.values().tolist()
+            card["gates"] = network.student.gates.log_alpha.tolist()
         texts = card_texts(touch, card)
         write_policy(deployed(network), texts, folder / f"{key.name}.pt")
         write_onnx_policy(network, texts, folder / f"{key.name}.onnx")
@@ -145,17 +147,17 @@ def chosen_layout(saved: PolicyFile, taxels: int | None, progress: Progress) -> 
     card, file = saved.card or {}, saved.file
     if "gates" not in card:
         raise PolicyError(f"{file}: this policy has no gates; teach a student with distill.gates")
-    gates = np.array(card["gates"])
-    num_open = int((gates > 0.0).sum())
-    if not num_open or (taxels or 0) > num_open:
-        raise PolicyError(f"{file}: {num_open} of {len(gates)} gates are open" + (f", not {taxels}" if taxels else ""))
+    log_alpha = np.array(card["gates"])
+    count = taxels or int((openings(torch.from_numpy(log_alpha)) > 0.0).sum())
+    if not 0 < count <= len(log_alpha):
+        raise PolicyError(f"{file}: {count or 'none'} of its {len(log_alpha)} taxels; give --taxels from 1 to {len(log_alpha)}")
     loaded = load_task(card["task"], card["overrides"])
     sensors = compile_sensors(loaded, "cpu", progress)
     check_card(saved, card["joints"], sensors.touch)
     name, touch = sensors.touch.plan.origin.resolution, sensors.groups[GROUP].layout
     spec, layouts = all_layouts(loaded.folder / loaded.spec.document, {}, [name])
     layout = layouts[name]
-    widest = np.argsort(-gates, kind="stable")[: taxels or num_open]
+    widest = np.argsort(-log_alpha, kind="stable")[:count]
     chosen = layout.taxels_of(tuple(link.name for link in touch.links))[widest]
     on_chosen_links = np.isin(layout.link_id, layout.link_id[chosen])
     kept = np.union1d(chosen, np.flatnonzero(~on_chosen_links))
