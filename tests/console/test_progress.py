@@ -59,7 +59,7 @@ def test_compile_reports_its_steps_in_order(folder):
         "lowering sensor depth",
         "lowering sensor near",
         "object item: distances",
-        "object item: moments of its surface",
+        "object item: moments of its surface, kept for the next time",
         "compiling the scene",
     ]
 

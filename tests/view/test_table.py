@@ -35,6 +35,7 @@ def touch(tmp_path_factory):
                 "depth": {"kind": "contact_depth", "links": "palm", "feels": ["cube"], "readout": "both"},
                 "bit": {"kind": "contact", "links": "tip", "feels": ["cube"]},
                 "twist": {"kind": "kinematic_taxel", "links": "tip", "feels": ["cube"], "outputs": ["torque"]},
+                "net": {"kind": "link_contact", "links": "palm", "feels": ["cube"]},
             },
         }
     )
@@ -46,26 +47,27 @@ def readings() -> dict[str, torch.Tensor]:
     depth = torch.tensor([[1e-3], [2.5e-3], [0.0]])
     bit, torque = torch.tensor([[1.0], [0.0]]), torch.tensor([[-0.3, 0, 0.4], [0.1, 0, 0]])
     first = {"touch": reading, "depth": depth, "depth/clean": 2 * depth, "bit": bit, "twist": torque}
+    first["net"] = torch.tensor([[1.0, 0, 3, 4]])
     return {name: torch.stack([0 * value, value]).requires_grad_() for name, value in first.items()}
 
 
 def test_numbers_match_sums_by_hand(touch):
-    # palm: |(3, 4, 12)| = 13; largest depth 2.5 mm. tip: |(-6, 8, 0)| = 10; one of two taxels; largest |torque| 0.5
+    # palm: |(3, 4, 12)| = 13; largest depth 2.5 mm. tip: |(-6, 8, 0)| = 10; one of two taxels; largest |torque| 0.5. net: |(0, 3, 4)| = 5, beside the contact bit
     assert table(touch, readings(), env=1) == [
-        "link  touch [N]  depth [m]  depth/clean [m]  bit [taxels]  twist [N·m]",
-        "────  ─────────  ─────────  ───────────────  ────────────  ───────────",
-        "palm     13.000   2.50e-03         5.00e-03             –            –",
-        "tip      10.000          –                –           1/2     5.00e-01",
+        "link  touch [N]  depth [m]  depth/clean [m]  bit [taxels]  twist [N·m]  net [N]",
+        "────  ─────────  ─────────  ───────────────  ────────────  ───────────  ───────",
+        "palm     13.000   2.50e-03         5.00e-03             –            –    5.000",
+        "tip      10.000          –                –           1/2     5.00e-01        –",
     ]
 
 
 def test_the_first_environment_is_the_default(touch):
     assert table(touch, readings()) == table(touch, readings(), env=0)
-    assert table(touch, readings())[2].split() == ["palm", "0.000", "0", "0", "–", "–"]
+    assert table(touch, readings())[2].split() == ["palm", "0.000", "0", "0", "–", "–", "0.000"]
 
 
 def test_rounding_is_printed_as_zero(touch):
     """Up to 1 µm and 1 µN·m, float32's rounding of centimetres and newtons."""
     small = {"depth": torch.full((1, 3, 1), 0.9e-6), "depth/clean": torch.full((1, 3, 1), 1.1e-6)}
     rest = {name: value[:1] for name, value in readings().items() if name not in small}
-    assert table(touch, rest | small)[2].split() == ["palm", "0.000", "0", "1.10e-06", "–", "–"]
+    assert table(touch, rest | small)[2].split() == ["palm", "0.000", "0", "1.10e-06", "–", "–", "0.000"]

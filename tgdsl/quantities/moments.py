@@ -191,7 +191,7 @@ class _Moments(Quantity):
                 if key in numbers or not radii or planning.object_id(name) is None:
                     continue
                 try:
-                    planning.progress(f"object {name}: moments of its surface")
+                    planning.progress(f"object {name}: moments of its surface, kept for the next time")
                     number = planning.object_id(name)
                     tables.append(moment_table(planning.sensed[name], use.request, radii, use.largest_shift, number))
                     numbers[key] = len(tables) - 1
