@@ -1,9 +1,9 @@
 """Measure primitive colliders, capped iterations and tolerances: the speed of physics, and its error against exact settings.
 
-    python benchmarks/colliders.py speed --device cuda --envs 8192 --out out/colliders --limit 240
-    python benchmarks/colliders.py error --out out/colliders                     # on a CPU, one thread
-    python benchmarks/colliders.py load --states 256 --out out/colliders         # load on held objects, on a CPU
-    python benchmarks/colliders.py pairs                                        # pairs of links in contact, on a CPU
+    python benchmarks/colliders.py speed --device cuda --envs 8192
+    python benchmarks/colliders.py error                    # on a CPU, one thread
+    python benchmarks/colliders.py load --states 256        # load on held objects, on a CPU
+    python benchmarks/colliders.py pairs                    # pairs of links in contact, on a CPU
 
 `speed` runs MuJoCo Warp with the drives, random actions and randomisation of the task. Per variant it measures the time of a
 control step's physics (a CUDA graph from the same states; blocks alternate between variants; medians), and the Newton
@@ -46,7 +46,6 @@ SPEED_OPTIONS: tuple[dict[str, float], ...] = (
 )
 """Options of MuJoCo that replace the scene's; the first variant is the scene."""
 ERROR_OPTIONS = (*SPEED_OPTIONS, {"tolerance": 1e-6}, {"tolerance": 1e-3}, {"ls_iterations": 10})
-PARTS = ("speed", "error", "load", "pairs")
 
 
 # ---- speed
@@ -124,12 +123,10 @@ def _number(value: Any) -> float:
     return float(value.numpy().ravel()[0]) if hasattr(value, "numpy") else float(value)
 
 
-def speed(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Return a row per variant; after the time limit no other cone is measured."""
-    start, rows = time.perf_counter(), []
+def speed(options: argparse.Namespace) -> None:
+    """Print a row per variant, and the table."""
+    rows = []
     for cone in options.cones:
-        if time.perf_counter() - start > options.limit:
-            break
         scenes = {collision: TimedScene(options, collision, cone) for collision in options.collisions}
         variants = [Variant(collision, cone, solver) for solver in options.variants for collision in scenes]
         calls = []
@@ -149,15 +146,13 @@ def speed(options: argparse.Namespace) -> list[dict[str, Any]]:
                 all_counts[i].append(scene.counts())
         for variant, times, counts in zip(variants, all_times, all_counts, strict=True):
             numbers = {name: statistics.fmean(count[name] for count in counts) for name in counts[0]}
-            rows.append(asdict(variant) | {"ms": statistics.median(times), "blocks": times} | numbers)
+            rows.append(asdict(variant) | {"ms": statistics.median(times)} | numbers)
             print(variant.name, " ".join(f"{name} {rows[-1][name]:.3f}" for name in ("ms", *numbers)), flush=True)
         pairs = {name: int(scene.sim.warp_model.nxn_geom_pair_filtered.shape[0]) for name, scene in scenes.items()}
-        print(f"pairs of geoms that may meet: {pairs}; {time.perf_counter() - start:.0f} s", flush=True)
-        rows[-1]["candidates"] = pairs
-        colliders_error.write(options, "speed", rows)
+        print(f"pairs of geoms that may meet: {pairs}", flush=True)
         for scene in scenes.values():
             scene.env.close()
-    return rows
+    print(table(rows))
 
 
 # ---- the command line
@@ -174,6 +169,9 @@ def table(rows: list[dict[str, Any]]) -> str:
     return text_table(("colliders", "cone", "options", "ms", "faster", "rounds", "slowest", "contacts"), cells)
 
 
+PARTS = {"speed": speed, "error": colliders_error.error, "load": colliders_load.load, "pairs": colliders_error.pairs}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("part", choices=PARTS)
@@ -186,18 +184,13 @@ def main() -> None:
     parser.add_argument("--warm", type=int, default=60, help="control steps before timing")
     parser.add_argument("--blocks", type=int, default=7)
     parser.add_argument("--steps", type=int, default=5, help="control steps of a block")
-    parser.add_argument("--limit", type=float, default=240.0, help="time after which `speed` starts no other cone [s]")
     parser.add_argument("--states", type=int, default=64, help="number of states of `error`, `load` and `pairs`")
     parser.add_argument("--ahead", type=int, default=160, help="control steps from each state")
     parser.add_argument("--quick", action="store_true", help="only the first solver options")
-    parser.add_argument("--out", type=Path, help="write OUT_PART.json")
     options = parser.parse_args()
     options.variants = SPEED_OPTIONS[:3] if options.quick else SPEED_OPTIONS
     options.error_variants = ERROR_OPTIONS[:3] if options.quick else ERROR_OPTIONS
-    parts = {"speed": speed, "error": colliders_error.error, "load": colliders_load.load, "pairs": colliders_error.pairs}
-    rows = parts[options.part](options)
-    if options.part == "speed":
-        print(table(rows))
+    PARTS[options.part](options)
 
 
 if __name__ == "__main__":

@@ -15,10 +15,9 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import statistics
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -175,13 +174,13 @@ def angles(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.degrees(2 * np.arccos(np.clip(np.abs((one * other).sum(axis=-1)), 0, 1)))
 
 
-def compared(variant: Variant, outcomes: Sequence[Outcome], exact: Sequence[Outcome]) -> dict[str, Any]:
+def compared(outcomes: Sequence[Outcome], exact: Sequence[Outcome]) -> dict[str, float]:
     """Return a row of the table: a variant against the exact one."""
     pairs = list(zip(outcomes, exact, strict=True))
     moved = np.array([np.linalg.norm(a.place - b.place, axis=1) for a, b in pairs])
     turned = np.array([angles(a.turn, b.turn) for a, b in pairs])
     forces, differences = np.array([b.force for _, b in pairs]), np.array([a.force - b.force for a, b in pairs])
-    row: dict[str, Any] = asdict(variant)
+    row = {}
     for i, steps in enumerate((1, 10)):
         row[f"mm_{steps}"] = 1e3 * float(np.sqrt((moved[:, i] ** 2).mean()))
         row[f"mm_{steps}_median"] = 1e3 * float(np.median(moved[:, i]))
@@ -197,30 +196,25 @@ def compared(variant: Variant, outcomes: Sequence[Outcome], exact: Sequence[Outc
 COLUMNS = ("mm_1", "mm_10", "mm_10_median", "deg_1", "deg_10", "force_%", "load_%", "depth_mm", "stays_%", "rounds")
 
 
-def error(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Return a row per variant of colliders and options, each against the exact one with its own cone."""
+def error(options: argparse.Namespace) -> None:
+    """Print a row per variant of colliders and options, each against the exact one with the same cone."""
     scenes = Scenes(options.task)
     starts = instants(scenes, options.states, options.ahead)
     print(f"{'variant':<52} {' '.join(f'{name:>12}' for name in COLUMNS)}")
-    rows = []
     exact = {cone: [outcome(scenes, Variant("mesh", cone), start) for start in starts] for cone in options.cones}
     for cone in options.cones:
         for collision, solver in itertools.product(options.collisions, options.error_variants):
             variant = Variant(collision, cone, solver)
-            rows.append(compared(variant, [outcome(scenes, variant, start) for start in starts], exact[cone]))
-            print(variant.name, " ".join(f"{rows[-1][name]:12.3f}" for name in COLUMNS), flush=True)
-            write(options, "error", rows)
+            row = compared([outcome(scenes, variant, start) for start in starts], exact[cone])
+            print(variant.name, " ".join(f"{row[name]:12.3f}" for name in COLUMNS), flush=True)
     if len(options.cones) == 2:
-        other = compared(Variant("mesh", "pyramidal, against elliptic"), exact["pyramidal"], exact["elliptic"])
-        rows.append(other)
-        print(f"{'mesh pyramidal against mesh elliptic':<52}", " ".join(f"{other[name]:12.3f}" for name in COLUMNS))
-    write(options, "error", rows)
-    return rows
+        row = compared(exact["pyramidal"], exact["elliptic"])
+        print(f"{'mesh pyramidal against mesh elliptic':<52}", " ".join(f"{row[name]:12.3f}" for name in COLUMNS))
 
 
-def pairs(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Return per kind of colliders the number of pairs of geoms that may meet, and the pairs of bodies in contact in a run."""
-    scenes, rows = Scenes(options.task), []
+def pairs(options: argparse.Namespace) -> None:
+    """Print per kind of colliders the number of pairs of geoms that may meet, and the pairs of bodies in contact in a run."""
+    scenes = Scenes(options.task)
     starts = instants(scenes, options.states, options.ahead)
     for collision in options.collisions:
         variant, met, least = Variant(collision, "elliptic"), dict[str, int](), dict[str, float]()
@@ -236,12 +230,9 @@ def pairs(options: argparse.Namespace) -> list[dict[str, Any]]:
                     met[name] = met.get(name, 0) + 1
                     least[name] = min(least.get(name, 0.0), float(data.contact[k].dist))
         may = candidates(scenes.model(variant, 0))
-        rows.append({"collision": collision, "candidates": may, "met": met})
         print(f"{collision}: {sum(may.values())} pairs of geoms may meet: {may}")
         for name, count in sorted(met.items(), key=lambda item: -item[1]):
             print(f"  {name:<70} {count:7d} contacts, deepest {-1e3 * least[name]:.2f} mm")
-    write(options, "pairs", rows)
-    return rows
 
 
 def candidates(model: mujoco.MjModel) -> dict[str, int]:
@@ -260,10 +251,3 @@ def candidates(model: mujoco.MjModel) -> dict[str, int]:
         kind = "link – object" if any(is_object) and one else "world – other" if not one else "link – link"
         counts[kind] += 1
     return counts
-
-
-def write(options: argparse.Namespace, part: str, rows: list[dict[str, Any]]) -> None:
-    """Write the rows of a part as JSON."""
-    if options.out:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.with_name(f"{options.out.name}_{part}.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")

@@ -33,9 +33,9 @@ SETTLING = 40
 KINDS = ("mesh", "mesh, one contact a pair", "primitive")
 
 
-def load(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Return a row per cone, impedance and kind of colliders."""
-    scenes, rows = Scenes(options.task), []
+def load(options: argparse.Namespace) -> None:
+    """Print a row per cone, impedance and kind of colliders."""
+    scenes = Scenes(options.task)
     held = _held(scenes, options.states)
     print(f"{len(held)} of {options.states} objects are held")
     print(f"{'colliders':<26} {'cone':<9} d      load_%  force contacts depth_mm held")
@@ -43,11 +43,9 @@ def load(options: argparse.Namespace) -> list[dict[str, Any]]:
         for impedance in IMPEDANCES:
             loads = {kind: np.array([_settled(scenes, kind, cone, impedance, start)[1:] for start in held]) for kind in KINDS}
             for kind, values in loads.items():
-                rows.append({"colliders": kind, "cone": cone, "d": impedance} | _row(values, loads["mesh"]))
-                text = "{load_%:6.0f} {force:6.2f} {contacts:8.2f} {depth_mm:8.2f} {held:4d}".format_map(rows[-1])
+                row = _row(values, loads["mesh"])
+                text = "{load_%:6.0f} {force:6.2f} {contacts:8.2f} {depth_mm:8.2f} {held:4d}".format_map(row)
                 print(f"{kind:<26} {cone:<9} {impedance or 'scene':<6} {text}", flush=True)
-    colliders_error.write(options, "load", rows)
-    return rows
 
 
 def _held(scenes: Scenes, count: int) -> list[Instant]:

@@ -29,7 +29,7 @@ from tgdsl.sensors.elastomer import point_anchors
 
 @dataclass(frozen=True)
 class Options:
-    """The command line."""
+    """Command-line options."""
 
     num_envs: int = 1024
     threads: int = 1
@@ -115,4 +115,4 @@ def on_pad(touch: TactileModule, num_envs: int, height: float, shift: float) -> 
 
 
 if __name__ == "__main__":
-    tyro.cli(Options).run()
+    tyro.cli(Options, description=__doc__).run()

@@ -1,7 +1,7 @@
 """Time a step of a task's environments: against physics and module alone, in parts, and over a long run.
 
     python benchmarks/envs.py                                                    # all tasks of examples/tasks, on the CPU
-    python benchmarks/envs.py --device cuda --envs 8192 --seconds 100 --out out/envs
+    python benchmarks/envs.py --device cuda --envs 8192 --seconds 100 --out out/envs.json
     python benchmarks/envs.py examples/tasks/in_palm_rotate.yaml --cones pyramidal --set randomise.drive={}
 
 Actions are random, and environments reset themselves. For each task and friction cone:
@@ -18,7 +18,6 @@ Actions are random, and environments reset themselves. For each task and frictio
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import statistics
 import time
@@ -352,7 +351,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=20, help="control steps of a block")
     parser.add_argument("--warm", type=int, default=WARM_STEPS, help="control steps before timing")
     parser.add_argument("--seconds", type=float, default=0.0, help="duration of the long run")
-    parser.add_argument("--out", type=Path, help="write OUT.json and OUT.csv")
+    parser.add_argument("--out", type=Path, help="JSON file")
     options = parser.parse_args()
     torch.set_num_threads(options.torch_threads or options.threads)
     tasks = options.tasks or sorted(file for file in TASKS.glob("*.yaml") if "\ntask:" in file.read_text(encoding="utf-8"))
@@ -362,17 +361,8 @@ def main() -> None:
             rows.append(measure(options, task, cone))
             print(text(rows[-1]), flush=True)
             if options.out:
-                write(options.out, rows)
-
-
-def write(out: Path, rows: list[dict[str, Any]]) -> None:
-    """Write rows as JSON, and the table as CSV."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.with_suffix(".json").write_text(json.dumps(rows, indent=1), encoding="utf-8")
-    with out.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
-        table = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
-        table.writeheader()
-        table.writerows(rows)
+                options.out.parent.mkdir(parents=True, exist_ok=True)
+                options.out.write_text(json.dumps(rows, indent=1), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -116,6 +116,8 @@ class Measure:
     device: str = "cpu"
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path(".")
     """Folder for geometry-DEVICE.md and geometry-DEVICE.png."""
+    compiled: bool = True
+    """Whether to compile the queries; on a CPU that takes a minute for each tricubic grid."""
 
     def run(self) -> None:
         """Measure, print, and write table and plot."""
@@ -126,7 +128,7 @@ class Measure:
             shape = {key.removeprefix(f"{name}/"): value for key, value in arrays.items() if key.startswith(f"{name}/")}
             for dtype in (torch.float32, torch.float64):
                 for way, nbytes, query, is_compiled in queries(name, shape, dtype, self.device):
-                    rows.append(row(name, way, nbytes, query, is_compiled, shape, dtype, self.device))
+                    rows.append(row(name, way, nbytes, query, is_compiled and self.compiled, shape, dtype, self.device))
                     print(rows[-1])
         reference = next(r for r in rows if r.shape == "box" and r.way == "analytic").nanoseconds
         write(rows, reference, self.device, self.out)

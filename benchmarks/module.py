@@ -34,7 +34,7 @@ PAD = """
 
 @dataclass(frozen=True)
 class Options:
-    """The command line."""
+    """Command-line options."""
 
     device: str = "cpu"
     num_envs: int = 1024
@@ -177,4 +177,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    main(tyro.cli(Options, description=__doc__))

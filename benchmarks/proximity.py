@@ -49,7 +49,7 @@ BACKENDS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Options:
-    """The command line."""
+    """Command-line options."""
 
     device: str = "cpu"
     num_envs: int = 1024
@@ -137,4 +137,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    main(tyro.cli(Options, description=__doc__))

@@ -29,7 +29,7 @@ SENSORS = {
 
 @dataclass(frozen=True)
 class Options:
-    """The command line."""
+    """Command-line options."""
 
     device: str = "cpu"
     num_envs: int = 512
@@ -76,4 +76,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    main(tyro.cli(Options, description=__doc__))
