@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Int
 from scipy.stats import t as student_t
 
 from tgdsl.compiler.pipeline import all_layouts
@@ -28,7 +29,7 @@ from tgdsl.layout.layout import Layout
 from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.playing.evaluation import Evaluation
 from tgdsl.rl.playing.policy import PolicyError, PolicyFile, card_texts, check_card, write_onnx_policy, write_policy
-from tgdsl.rl.sensors import GROUP, PolicyTouch, compile_sensors
+from tgdsl.rl.sensors import GROUP, PolicyTouch, TaskSensors, compile_sensors
 from tgdsl.rl.students.gates import openings
 from tgdsl.rl.students.keys import StudentKey, own_task
 from tgdsl.rl.students.learner import Distiller
@@ -140,10 +141,7 @@ CHOSEN = "chosen"  # the group of links with chosen taxels
 
 
 def chosen_layout(saved: PolicyFile, taxels: int | None, progress: Progress) -> tuple[LayoutSpec, dict[str, Layout]]:
-    """Return a student's layout with the taxels of its widest gates alone (None: of all open ones), at its resolution.
-
-    Links without any are left as they are, as other sensors and the teacher may need them; the others are a group.
-    """
+    """Return a student's layout with the taxels of its widest gates alone (None: of all open ones): see `reduced_layout`."""
     card, file = saved.card or {}, saved.file
     if "gates" not in card:
         raise PolicyError(f"{file}: this policy has no gates; teach a student with distill.gates")
@@ -154,11 +152,20 @@ def chosen_layout(saved: PolicyFile, taxels: int | None, progress: Progress) -> 
     loaded = load_task(card["task"], card["overrides"])
     sensors = compile_sensors(loaded, "cpu", progress)
     check_card(saved, card["joints"], sensors.touch)
+    return reduced_layout(loaded, sensors, np.argsort(-log_alpha, kind="stable")[:count])
+
+
+def reduced_layout(
+    loaded: LoadedTask, sensors: TaskSensors, rows: Int[np.ndarray, " chosen"]
+) -> tuple[LayoutSpec, dict[str, Layout]]:
+    """Return a task's layout with only some taxels of its touch, at its resolution; their links are the group `chosen`.
+
+    Links without any are left as they are, as other sensors and the teacher may need them.
+    """
     name, touch = sensors.touch.plan.origin.resolution, sensors.groups[GROUP].layout
     spec, layouts = all_layouts(loaded.folder / loaded.spec.document, {}, [name])
     layout = layouts[name]
-    widest = np.argsort(-log_alpha, kind="stable")[:count]
-    chosen = layout.taxels_of(tuple(link.name for link in touch.links))[widest]
+    chosen = layout.taxels_of(tuple(link.name for link in touch.links))[rows]
     on_chosen_links = np.isin(layout.link_id, layout.link_id[chosen])
     kept = np.union1d(chosen, np.flatnonzero(~on_chosen_links))
     links = tuple(escape(layout.links[i].name) for i in np.unique(layout.link_id[chosen]))
