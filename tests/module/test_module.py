@@ -399,3 +399,12 @@ def test_no_compiler_means_eager_and_a_warning(touch, monkeypatch):
     with pytest.warns(UserWarning, match=r"no C\+\+ compiler \(g\+\+, clang\+\+ or \$CXX\): the module stays eager"):
         touch.compile()
     touch(touch.example_state(2))
+
+
+def test_compile_takes_inductor_options_unless_a_mode_options_or_backend_is_given(touch, monkeypatch):
+    seen = []
+    monkeypatch.setattr(touch.calls, "compile", lambda graph, **options: seen.append(options))
+    for options in ({}, {"mode": "reduce-overhead"}, {"backend": "eager"}, {"options": {}}):
+        touch.compile(**options)
+    assert seen[0]["options"] == touch.inductor_options() and seen[0]["fullgraph"] and seen[0]["dynamic"]
+    assert [each.get("options") for each in seen[1:]] == [None, None, {}]
