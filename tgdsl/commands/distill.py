@@ -257,7 +257,14 @@ class _Part:
             return []
         plain = {key.name: evaluation.plain() for key, evaluation in zip(keys, result, strict=True)}
         args.write_json(folder.evaluation, plain)
-        return rows_of(keys, result, self.resolution, distiller.samples // len(keys), round(run.seconds / 60.0, 2))
+        return rows_of(
+            keys,
+            result,
+            self._loaded.task.score_range,
+            self.resolution,
+            distiller.samples // len(keys),
+            round(run.seconds / 60.0, 2),
+        )
 
 
 def _warn_unlike(rows: list[Row]) -> None:

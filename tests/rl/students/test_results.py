@@ -52,6 +52,7 @@ def test_the_interval_of_one_seed_is_that_of_its_episodes():
 
 
 def test_rows_are_means_over_seeds():
+    """Intervals end at the range of scores, 0.08 to 0.7."""
     keys = student_keys(["depth", "none"], ["tips"], ["clean"], 2)
     evaluations = [
         evaluation(0.5, 0.3, 0.25),
@@ -59,10 +60,10 @@ def test_rows_are_means_over_seeds():
         evaluation(0.1, 0.03, 1.0),
         evaluation(0.1, 0.04, 0.4, 20),
     ]
-    depth, none = rows_of(keys, evaluations, "med", 1000, 2.5)
+    depth, none = rows_of(keys, evaluations, (0.08, 0.7), "med", 1000, 2.5)
     assert depth[:5] == ("depth", "tips", "med", "clean", 2) and none[:5] == ("none", "", "med", "", 2)
-    assert depth[5:9] == pytest.approx((0.505, 0.255, 0.755, 0.375))
-    assert none[5:9] == pytest.approx((0.1, 0.075, 0.125, 0.7))
+    assert depth[5:9] == pytest.approx((0.505, 0.255, 0.7, 0.375))
+    assert none[5:9] == pytest.approx((0.1, 0.08, 0.125, 0.7))
     assert depth[9:] == (20, 1000, 2.5) and none[9:] == (30, 1000, 2.5)
 
 
@@ -71,7 +72,7 @@ def test_a_score_that_is_not_finite_affects_only_its_row(score):
     """It has no interval, is printed, and raises nothing."""
     keys = student_keys(["bool", "depth"], ["tips"], ["clean"], 2)
     evaluations = [evaluation(score if key.kind[0] == "bool" and key.seed == 0 else 0.5, 0.1) for key in keys]
-    rows = {row.type: row for row in rows_of(keys, evaluations, "med", 3, 4.0)}
+    rows = {row.type: row for row in rows_of(keys, evaluations, (-math.inf, math.inf), "med", 3, 4.0)}
     assert not math.isfinite(rows["bool"].score) and not math.isfinite(rows["bool"].low)
     assert rows["depth"].score == 0.5 and rows["depth"].low == pytest.approx(0.5 - 0.1 / math.sqrt(2))
     line = next(line for line in shown(list(rows.values()), "RMS").splitlines() if line.startswith("bool"))

@@ -59,9 +59,14 @@ class Row(NamedTuple):
 
 
 def rows_of(
-    keys: Sequence[StudentKey], evaluations: Sequence[Evaluation], resolution: str, samples: int, minutes: float
+    keys: Sequence[StudentKey],
+    evaluations: Sequence[Evaluation],
+    score_range: tuple[float, float],
+    resolution: str,
+    samples: int,
+    minutes: float,
 ) -> list[Row]:
-    """Return the rows of students."""
+    """Return the rows of students, with intervals within the range of the task's scores."""
     kinds: dict[tuple[str, str, str], list[Evaluation]] = {}
     for key, evaluation in zip(keys, evaluations, strict=True):
         kinds.setdefault(key.kind, []).append(evaluation)
@@ -69,6 +74,8 @@ def rows_of(
     for (type_, placement, noise), each in kinds.items():
         score, held = fmean(one.score for one in each), fmean(one.held for one in each)
         low, high = interval(each)
+        if math.isfinite(low) and math.isfinite(high):
+            low, high = max(low, score_range[0]), min(high, score_range[1])
         episodes = sum(one.episodes for one in each)
         rows.append(Row(type_, placement, resolution, noise, len(each), score, low, high, held, episodes, samples, minutes))
     return rows
