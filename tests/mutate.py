@@ -351,7 +351,12 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=60.0, help="seconds of tests per change")
     parser.add_argument("--least", type=float, default=0.0, help="least share of killed changes")
     parser.add_argument("--refresh", action="store_true", help="record again which test reaches which line")
-    parser.add_argument("--tests", nargs=argparse.REMAINDER, default=["-m", "not slow or oracle"], help="last: arguments of pytest for the record")
+    parser.add_argument(
+        "--tests",
+        nargs=argparse.REMAINDER,
+        default=["-m", "not slow or oracle"],
+        help="last: arguments of pytest for the record",
+    )
     options = parser.parse_args()
     os.chdir(REPOSITORY)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
