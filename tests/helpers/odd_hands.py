@@ -138,7 +138,7 @@ HANDS = {
         tips=("hand/f.1/the tip", "hand/f.2/the tip"),
         palm=("hand/base link",),
         fingers=tuple(f"hand/f.{i}/{part}" for i in (1, 2) for part in ("proximal", "middle", "the tip")),
-        facing=(("hand/f.1/the tip", (1, 0, 0)), ("hand/f.2/middle", (1, 0, 0)), ("hand/base link", None)),
+        facing=(("hand/f.1/the tip", (1, 0, 0)), ("hand/f.2/middle", (1, 0, 0)), ("hand/base link", (0, 0, 1))),
     ),
     "four_bar": OddHand(
         FOUR_BAR,

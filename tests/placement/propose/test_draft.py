@@ -66,14 +66,14 @@ def test_sides_and_regions_can_change_and_return(tmp_path):
     draft.change(["left_tip"], facing=(-1.0, 0.0, 0.0))
     low, high = draft.bounds("right_tip")
     draft.change(["right_tip"], box=((*low[:2], 0.016), high))
-    draft.change(["palm"], facing=(0.0, 0.0, 1.0))  # the guess covers all sides
+    draft.change(["palm"], facing=(0.0, 0.0, -1.0))  # the guess is the side on which the fingers stand
     taxels = taxels_of(draft, tmp_path)
     assert (taxels["left_tip"]["normal"] @ [-1, 0, 0]).min() > np.cos(np.radians(75))
     assert len(taxels["left_tip"]) == 19
     assert taxels["right_tip"]["pos"][:, 2].min() >= 0.016 - 1e-6 and len(taxels["right_tip"]) == 10  # half of 19.2
     assert (taxels["right_tip"]["normal"] @ [-1, 0, 0]).min() > 0.99
     assert len(taxels["palm"]) == 4 * 8 * 6  # 8 × 6 cm
-    np.testing.assert_allclose(taxels["palm"]["normal"] @ [0, 0, 1], 1.0)
+    np.testing.assert_allclose(taxels["palm"]["normal"] @ [0, 0, -1], 1.0)
     text = lines_of(draft)
     assert text[0].endswith("and changed by hand; comments mark the guesses.")
     assert text[[line.startswith("    left_tip: {method") for line in text].index(True)].endswith(
@@ -87,7 +87,7 @@ def test_sides_and_regions_can_change_and_return(tmp_path):
     ] * 2
     draft.change(["left_tip"], facing=(1.0, 0.0, 0.0))
     draft.change(["right_tip"], box=None)
-    draft.change(["palm"], facing=None)
+    draft.change(["palm"], facing=(0.0, 0.0, 1.0))
     assert lines_of(draft) == guess
 
 

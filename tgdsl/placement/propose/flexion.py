@@ -2,8 +2,8 @@
 
 In the open pose, a link's inner side faces the direction in which the link moves as the nearest joint above it that has a lever
 on it closes. A link before all closing joints takes the side of the nearest link beyond. The last links of two chains that
-close on each other without curling face each other along the line on which they meet. A palm's inner side faces the closing
-tips, a fixed jaw's the moving jaw.
+close on each other without curling face each other along the line on which they meet. A palm's inner side is the
+one on which all fingers stand if they close above its middle; else it faces the closing tips, a fixed jaw's the moving jaw.
 
 `PalmFront` finds the surface of a palm that an object can reach: no surface behind other fixed bodies or outside the hand.
 
@@ -37,6 +37,9 @@ MAX_SIDES = 32  # faces that are tried as parts of it, from the largest on
 TURNED = np.radians(15.1)  # an axis this close to a flat side's normal replaces it; the adjacent sides are excluded
 STEP = 0.02  # share of its range by which a joint closes to find where a link moves
 MIN_COSINE = 0.5  # least cosine between the directions in which fingers curl, if they are to decide where the palm faces
+ABOVE, STANDING = 0.95, 0.8
+"""Least cosine of the angle to a palm's side at which tips are above its middle, and the least height of the joints of fingers
+that stand on it, as a share of the palm's own from its centre."""
 PARALLEL, BESIDE = 0.99, 0.25
 """A bar next to a finger turns about an axis with at least this cosine to the finger's, nearer than this part of its length."""
 ALONG = 0.3  # least cosine of the angle between where a link faces and where its own hinge carries it; else its side is weak
@@ -228,6 +231,8 @@ class Flexion:
 
     def palm_side(self, body: int) -> InnerSide:
         """Return where a palm's inner side faces, in the frame of it or of a body that is fixed to it."""
+        if (side := self._side_with_fingers(body)) is not None:
+            return InnerSide(side)
         turned = self._frames(self.open).xmat[body].reshape(3, 3).copy()
         curled = self._curl_direction()
         if curled is not None and (direction := self._snapped(body, turned.T @ curled, PALM_SNAP)) is not None:
@@ -244,6 +249,21 @@ class Flexion:
             if direction is not None and min(half @ direction, whole @ direction) > 0.5:
                 return InnerSide(direction)
         return InnerSide(None, UNCLEAR)
+
+    def _side_with_fingers(self, body: int) -> tuple[float, ...] | None:
+        """Return the side of a palm on which all fingers stand, if their half closed tips are above its middle."""
+        palm, chains, data = self.hand.palm, self.hand.chains, self.tree.start
+        if palm is None or len(chains) < 2:
+            return None
+        centre = self.tree.centre(palm, data)
+        half = self._toward(centre, body, self.hand.tips, 0.5)
+        direction = self._snapped(body, half, PALM_SNAP)
+        if direction is None or half @ direction < ABOVE * np.linalg.norm(direction):
+            return None
+        along = data.xmat[body].reshape(3, 3) @ direction
+        height = (self.tree.points(palm, data) - centre) @ along
+        roots = np.array([anchor(self.tree, chain[0]) - centre for chain in chains]) @ along
+        return direction if roots.min() >= STANDING * height.max() else None
 
     def _curl_direction(self) -> Float[np.ndarray, " 3"] | None:
         """Return where most fingers, as they curl, carry their first bones in the open pose; None if no majority does."""
