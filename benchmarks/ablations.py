@@ -92,7 +92,7 @@ class Kept:
         return next((own for own in half if (own.type, place_of(own)) == (row.type, place_of(row))), None)
 
     def has_converged(self, row: Row, iterations: int) -> bool | None:
-        """Return whether students have converged; None: no run had half as many iterations."""
+        """Return whether students have converged, with a score of 0 never; None: no run had half as many iterations."""
         before = self.before(row, iterations)
         return None if before is None else abs(row.score - before.score) < CHANGE * abs(row.score)
 
@@ -104,7 +104,8 @@ class Kept:
             return []
         beside = [own for own in converged if place_of(own) == place_of(row) or (NONE in (own.type, row.type))]
         low, high = ("low", "high") if sign > 0 else ("high", "low")
-        return [own.type for own in beside if sign * getattr(row, high) < sign * getattr(own, low)]
+        worse = [own.type for own in beside if sign * getattr(row, high) < sign * getattr(own, low)]
+        return list(dict.fromkeys(worse))
 
 
 def place_of(row: Row) -> Place:

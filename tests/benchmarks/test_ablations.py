@@ -41,6 +41,7 @@ def test_students_have_converged_if_twice_the_iterations_change_little():
         results = kept({"force": (before, 10.0)})
         assert results.has_converged(results.rows[400][0], 400) is expected
         assert results.has_converged(results.rows[200][0], 200) is None
+    assert kept({"none": (0.0, 0.0)}).has_converged(row("none", 0.0), 400) is False, "it may not have begun to learn"
     alone = ablations.Kept("made_up", {"is_less_better": False}, {300: [row("force", 1.0)], 400: [row("force", 1.0)]}, {})
     assert alone.has_converged(alone.rows[400][0], 400) is None
 

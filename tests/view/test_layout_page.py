@@ -88,7 +88,7 @@ def test_links_can_leave_and_join_groups(tmp_path):
         page.react()
         page.members["palm"]["palm"].value = True
         page.react()
-        assert page.side.value == ALL_AROUND
+        assert page.side.value == "+z"
 
 
 def test_an_invalid_value_is_shown_and_blocks_writing(tmp_path):
