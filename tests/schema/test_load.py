@@ -6,6 +6,7 @@ from wrong import WRONG, WRONG_LAYOUT
 
 from tgdsl.errors import SpecError, did_you_mean, listed
 from tgdsl.schema.load import load, load_layout
+from tgdsl.schema.yaml import parse
 
 
 def test_a_valid_document_is_loaded(tmp_path):
@@ -167,6 +168,14 @@ def test_wrong_overrides_are_refused(tmp_path, key, text, message):
     messages = mistakes(tmp_path, overrides={key: text})
     assert message in messages
     assert all(line.startswith("--set ") for line in messages)
+
+
+def test_new_entries_are_compared_with_other_mappings():
+    """`gates` is no misspelt `steps`, whose value leads nowhere."""
+    source = parse("steps: 8\ntouch: {kind: contact}\n", "task.yaml")
+    source.set("gates.taxels", "0")
+    source.set("tuch.links", "tips")
+    assert source.added == {"tuch": '"tuch" is new: did you mean "touch"?'}
 
 
 def test_documents_can_be_mappings(tmp_path, monkeypatch):

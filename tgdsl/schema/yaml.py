@@ -95,7 +95,7 @@ class Source:
         parent = self.value
         for i, part in enumerate(path[:-1]):
             if isinstance(parent, dict) and part not in parent:
-                near = did_you_mean(str(part), map(str, parent))
+                near = did_you_mean(str(part), (str(key) for key, entry in parent.items() if isinstance(entry, dict)))
                 if near.startswith("did"):
                     self.added[path_text(path[: i + 1])] = f'"{part}" is new: {near}'
                 parent[part] = {}

@@ -400,6 +400,8 @@ def test_errors_in_the_document_are_located(make):
     ):
         with pytest.raises(SpecError, match=rf"distill\.gates: .*{problem}"):
             make(types=types, gates="{taxels: 2}")
+    with pytest.raises(SpecError, match=r"distill\.gates.*: depth at \w+ has (\d+) taxels, so no gate would close; give fewer"):
+        make(types=("depth",), gates="{taxels: 5000}")
     with pytest.raises(SpecError, match="steps is 5, expected a multiple of gradient_length, 2"):
         make(steps=5)
     with pytest.raises(SpecError, match="kernel is 2, expected an odd number"):

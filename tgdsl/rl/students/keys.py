@@ -132,6 +132,9 @@ def architecture(loaded: LoadedTask, env: TouchEnv, key: StudentKey, names: Sequ
                     problem = f"students with {key.touch.type} see no numbers of each taxel, which gates multiply"
                     raise loaded.error(("distill", "gates"), problem, "leave them out of --types")
                 gates = place, source.layout.num_taxels
+                if loaded.spec.distill.gates.taxels >= gates[1]:
+                    problem = f"{key.touch.type} at {key.touch.placement} has {gates[1]} taxels, so no gate would close"
+                    raise loaded.error(("distill", "gates", "taxels"), problem, "give fewer")
         else:
             encoder = Encoder(networks.kind, networks.encoder.hidden, networks.encoder.size)
         parts.append((size, encoder))
