@@ -4,11 +4,10 @@
     python benchmarks/ablations.py page
 
 `keep` copies the results of `tgdsl distill` to docs/measured/ablations/NAME; `page` writes tables and plots from all results
-there. Runs with more iterations are kept under the same name. Names SERIES__NETWORKS share a section and a plot.
+there. Runs that differ in their number of iterations alone have one name. Names SERIES__NETWORKS share a section and a plot.
 
 A student has **converged** if twice as many iterations change its score by less than 5 % of that score. A type is **worse**
-than another in the same place if both have converged and the 95 % intervals of their scores, over seeds and episodes, do not
-overlap.
+than another in the same place if both have converged and several seeds, and the 95 % intervals of their scores do not overlap.
 
 docs/measured/ablations/NAME holds
 
@@ -25,7 +24,7 @@ import io
 import json
 import math
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -38,16 +37,17 @@ from matplotlib.figure import Figure
 from tgdsl.errors import TgdslError
 from tgdsl.files.write import atomic_write_all, with_folder
 from tgdsl.rl.load import load_task
+from tgdsl.rl.sensors import PolicyTouch
 from tgdsl.rl.spec import touch_types
-from tgdsl.rl.students.keys import NONE
+from tgdsl.rl.students.keys import NONE, StudentKey
 from tgdsl.rl.students.results import Row
 
 ROOT = Path(__file__).parents[1]
-KEPT = ROOT / "docs" / "measured" / "ablations"
+RESULTS = ROOT / "docs" / "measured" / "ablations"
 PAGES = ROOT / "docs" / "background" / "ablations.md", ROOT / "docs" / "records" / "ablations.md"
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
 CHANGE = 0.05  # relative change of the score below which a student has converged
-POINTS = 60  # rows of a kept curve
+POINTS = 60  # rows of a curve
 YARDSTICKS = {"teacher": "teacher", "rest": "joints at rest"}
 COLOURS = {name: colormaps["tab10"](i % 10) for i, name in enumerate(touch_types())} | {NONE: "black"}
 Place = tuple[str, str, str]  # placement, resolution and noise
@@ -58,7 +58,7 @@ class AblationError(TgdslError):
 
 
 @dataclass(frozen=True)
-class Kept:
+class Results:
     """Results under one name: rows of the tables and curves by number of iterations."""
 
     name: str
@@ -89,7 +89,7 @@ class Kept:
     def before(self, row: Row, iterations: int) -> Row | None:
         """Return the row of the same students after half as many iterations."""
         half = self.rows.get(iterations // 2, []) if iterations % 2 == 0 else []
-        return next((own for own in half if (own.type, place_of(own)) == (row.type, place_of(row))), None)
+        return next((other for other in half if (other.type, place_of(other)) == (row.type, place_of(row))), None)
 
     def has_converged(self, row: Row, iterations: int) -> bool | None:
         """Return whether students have converged, with a score of 0 never; None: no run had half as many iterations."""
@@ -98,50 +98,62 @@ class Kept:
 
     def worse_than(self, row: Row, iterations: int) -> list[str]:
         """Return the types in the same place that a type is worse than."""
-        sign = -1.0 if self.run["is_less_better"] else 1.0
-        converged = [own for n, own in self.final.values() if self.has_converged(own, n)]
-        if row not in converged:
+        comparable = [other for n, other in self.final.values() if other.seeds > 1 and self.has_converged(other, n)]
+        if row not in comparable:
             return []
-        beside = [own for own in converged if place_of(own) == place_of(row) or (NONE in (own.type, row.type))]
-        low, high = ("low", "high") if sign > 0 else ("high", "low")
-        worse = [own.type for own in beside if sign * getattr(row, high) < sign * getattr(own, low)]
-        return list(dict.fromkeys(worse))
+        others = [other for other in comparable if place_of(other) == place_of(row) or is_same_without_touch(other, row)]
+        if self.run["is_less_better"]:
+            better = [other.type for other in others if other.high < row.low]
+        else:
+            better = [other.type for other in others if other.low > row.high]
+        return list(dict.fromkeys(better))
 
 
 def place_of(row: Row) -> Place:
     return row.placement, row.resolution, row.noise
 
 
-def keep(run: Path, name: str, evaluations: Mapping[str, Path | None], folder: Path = KEPT) -> Path:
+def is_same_without_touch(one: Row, other: Row) -> bool:
+    """Return whether one of two types has no touch: it is in each place of its resolution."""
+    return NONE in (one.type, other.type) and one.resolution == other.resolution
+
+
+def keep(run: Path, name: str, evaluations: Mapping[str, Path | None], folder: Path = RESULTS) -> Path:
     """Keep a run of `tgdsl distill` under a name; return the folder.
 
     Raises:
-        AblationError: If files are missing, or the name has results of another task or teacher; nothing is written.
+        AblationError: If files are missing, or the run differs in more than its iterations from those of the name; nothing is
+            written.
     """
     distill, table = _read_json(run / "distill.json"), _read(run / "table.csv")
     curves: dict[str, bytes] = {}
-    iterations, devices, document = 0, [], ""
+    lengths, devices, document = set(), [], ""
     for resolution in distill["resolutions"]:
         starts = _read_json(run / resolution / "run.json")["starts"]
         curve = list(csv.DictReader(io.StringIO(_read(run / resolution / "curve.csv"))))
-        iterations, document = int(curve[-1]["iteration"]), starts[-1]["task"]
+        lengths.add(int(curve[-1]["iteration"]))
+        document = starts[-1]["task"]
         devices += [start["device"] for start in starts]
         curves[f"{resolution}.csv"] = _thinned(curve, starts).encode()
+    if len(lengths) > 1:
+        raise AblationError(f"{run}: resolutions have {sorted(lengths)} iterations, expected one number")
     task = load_task(document if Path(document).is_file() else ROOT / document).task
-    made = {"document": _relative(document), "unit": task.score_unit, "is_less_better": task.is_less_better}
-    made |= {"teacher": _relative(distill["teacher"]), "envs": distill["envs"], "devices": sorted(set(devices))}
-    made |= {"overrides": distill["overrides"], "scores": {}}
+    record = {"document": _relative(document), "unit": task.score_unit, "is_less_better": task.is_less_better}
+    record |= {"teacher": _relative(distill["teacher"]), "envs": distill["envs"], "devices": sorted(set(devices))}
+    record |= {"overrides": distill["overrides"], "scores": {}}
     before = _read_json(folder / name / "run.json") if (folder / name / "run.json").is_file() else {}
-    for key in ("document", "teacher") if before else ():
-        if before[key] != made[key]:
-            raise AblationError(f"{name}: its results have {key} {before[key]}, this run has {made[key]}; choose another name")
+    for key in ("document", "teacher", "envs", "overrides") if before else ():
+        if before[key] != record[key]:
+            raise AblationError(
+                f"{name}: its results have {key} {before[key]}, this run has {record[key]}; choose another name"
+            )
     for who, file in evaluations.items():
         evaluation = _read_json(file) if file else before.get("scores", {}).get(who)
         if evaluation is not None:
-            made["scores"][who] = {key: evaluation[key] for key in ("score", "score_interval", "held", "episodes")}
+            record["scores"][who] = {key: evaluation[key] for key in ("score", "score_interval", "held", "episodes")}
     files = {"table.csv": table.encode(), **curves}
-    contents = {folder / name / str(iterations) / file: content for file, content in files.items()}
-    contents[folder / name / "run.json"] = (json.dumps(made, indent=1, ensure_ascii=False) + "\n").encode()
+    contents = {folder / name / str(*lengths) / file: content for file, content in files.items()}
+    contents[folder / name / "run.json"] = (json.dumps(record, indent=1, ensure_ascii=False) + "\n").encode()
     for file in contents:
         with_folder(file)
     atomic_write_all(contents)
@@ -170,20 +182,20 @@ def _thinned(curve: Sequence[Mapping[str, str]], starts: Sequence[Mapping[str, A
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["samples", "seconds", *columns])
-    for own in np.unique(span):
-        part = span == own
-        known = {name: value[part & np.isfinite(value)] for name, value in values.items()}
-        means = [f"{value.mean():.4g}" if len(value) else "" for value in known.values()]
+    for index in np.unique(span):
+        part = span == index
+        finite = [value[part & np.isfinite(value)] for value in values.values()]
+        means = [f"{value.mean():.4g}" if len(value) else "" for value in finite]
         writer.writerow([round(samples[part][-1] / len(names)), f"{seconds[part][-1]:.4g}", *means])
     return text.getvalue()
 
 
-def kept_runs(folder: Path = KEPT) -> list[Kept]:
+def all_results(folder: Path = RESULTS) -> list[Results]:
     """Return all results, by name."""
-    return [_kept(file.parent) for file in sorted(folder.glob("*/run.json"))]
+    return [_results(file.parent) for file in sorted(folder.glob("*/run.json"))]
 
 
-def _kept(folder: Path) -> Kept:
+def _results(folder: Path) -> Results:
     rows: dict[int, list[Row]] = {}
     curves: dict[int, dict[str, dict[str, np.ndarray]]] = {}
     kinds = get_type_hints(Row)
@@ -194,20 +206,19 @@ def _kept(folder: Path) -> Kept:
         for file in set(table.parent.glob("*.csv")) - {table}:
             lines = list(csv.DictReader(io.StringIO(_read(file))))
             curves[n][file.stem] = {key: np.array([float(line[key] or "nan") for line in lines]) for key in lines[0]}
-    return Kept(folder.name, _read_json(folder / "run.json"), rows, curves)
+    return Results(folder.name, _read_json(folder / "run.json"), rows, curves)
 
 
-def summary(runs: Sequence[Kept]) -> str:
+def summary(runs: Sequence[Results]) -> str:
     """Return a table of scores: a row per type, a column per place where more than two types were compared."""
     columns = [(run, place) for run in runs for place in run.places if len({row.type for row in run.rows[max(run.rows)]}) > 2]
-    types = dict.fromkeys(type_ for run, place in columns for type_, own in run.final if own == place)
+    types = dict.fromkeys(type_ for run, place in columns for type_, where in run.final if where == place)
     head = [f"`{Path(run.run['document']).stem}`, {_title(run, place)} [{run.run['unit']}]" for run, place in columns]
     lines = [("type", *head), ("---", *["---:"] * len(head))]
     for type_ in (*types, NONE):
         cells = []
         for run, place in columns:
-            own = ("", place[1], "") if type_ == NONE else place
-            n, row = run.final.get((type_, own), (0, None))
+            n, row = run.final.get((type_, ("", place[1], "") if type_ == NONE else place), (0, None))
             cells.append("–" if row is None else f"{row.score:.3f}{'' if run.has_converged(row, n) else '†'}")
         lines.append((f"`{type_}`", *cells))
     for who, title in YARDSTICKS.items():
@@ -220,13 +231,13 @@ def summary(runs: Sequence[Kept]) -> str:
     return _markdown(lines) + "\n\n† not known to have converged"
 
 
-def sections(runs: Sequence[Kept]) -> str:
+def sections(runs: Sequence[Results]) -> str:
     """Return a section per series: conditions, a table, and the plot."""
     parts = []
     for series, members in _by_series(runs).items():
         first = members[0].run
-        said = f"Task `{first['document']}`, teacher `{first['teacher']}`, "
-        said += f"on {', '.join(first['devices'])}, {first['envs']:,} environments."
+        conditions = f"Task `{first['document']}`, teacher `{first['teacher']}`, "
+        conditions += f"on {', '.join(first['devices'])}, {first['envs']:,} environments."
         head = (
             "where",
             "type",
@@ -242,7 +253,7 @@ def sections(runs: Sequence[Kept]) -> str:
             sign = 1.0 if first["is_less_better"] else -1.0
             order = sorted(run.final.values(), key=lambda each: (each[1].type == NONE, place_of(each[1]), sign * each[1].score))
             for n, row in order:
-                before, converged = run.before(row, n), run.has_converged(row, n)
+                before = run.before(row, n)
                 cells = [
                     _title(run, place_of(row)),
                     f"`{row.type}`",
@@ -250,31 +261,31 @@ def sections(runs: Sequence[Kept]) -> str:
                     _bounds((row.low, row.high)),
                     f"{n:,}",
                 ]
-                cells += ["–" if before is None else f"{before.score:.3f}", {None: "–", True: "yes", False: "no"}[converged]]
+                cells.append("–" if before is None else f"{before.score:.3f}")
+                cells.append({None: "–", True: "yes", False: "no"}[run.has_converged(row, n)])
                 cells += [", ".join(f"`{name}`" for name in run.worse_than(row, n)) or "–", f"{row.seeds}", f"{row.held:.1%}"]
                 lines.append((*cells, f"{row.samples / 1e6:.3g}"))
         for who, title in YARDSTICKS.items():
-            if own := first["scores"].get(who):
+            if score := first["scores"].get(who):
                 lines.append(
                     (
                         "",
                         f"*{title}*",
-                        f"{own['score']:.3f}",
-                        _bounds(own["score_interval"]),
+                        f"{score['score']:.3f}",
+                        _bounds(score["score_interval"]),
                         *[""] * 5,
-                        f"{own['held']:.1%}",
+                        f"{score['held']:.1%}",
                         "",
                     )
                 )
-        rows = [(n, row) for run in members for n, row in run.final.values()]
-        share = sum(bool(run.has_converged(row, n)) for run in members for n, row in run.final.values())
-        counted = f"{share} of {len(rows)} rows have converged."
+        converged = [run.has_converged(row, n) for run in members for n, row in run.final.values()]
+        count = f"{sum(map(bool, converged))} of {len(converged)} rows have converged."
         image = f"![Scores by control steps: {series}](../images/ablation_{series}.png)"
-        parts.append("\n\n".join([f"### {series}", said, _overrides(members), _markdown(lines), counted, image]))
+        parts.append("\n\n".join([f"### {series}", conditions, _overrides(members), _markdown(lines), count, image]))
     return "\n\n".join(parts) or "There are no results yet."
 
 
-def plot(members: Sequence[Kept]) -> Figure:
+def plot(members: Sequence[Results]) -> Figure:
     """Return scores by control steps, a panel per place: mean, least and largest of the seeds."""
     places = [(run, place) for run in members for place in run.places]
     columns = min(3, math.ceil(math.sqrt(len(places))))
@@ -282,11 +293,11 @@ def plot(members: Sequence[Kept]) -> Figure:
     figure = Figure(figsize=(1.5 + 4.2 * columns, 3.4 * rows), dpi=100, layout="constrained")
     panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
     for axes, (run, place) in zip(panels, places, strict=False):
-        for (type_, own), (n, row) in run.final.items():
-            if own not in (place, ("", place[1], "")):
+        for (type_, where), (n, row) in run.final.items():
+            if where not in (place, ("", place[1], "")):
                 continue
             curve = run.curves[n][place[1]]
-            scores = np.stack(list(_scores(curve, row)))
+            scores = np.stack([curve[f"Score/{key.name}"] for key in _keys(row)])
             millions = curve["samples"] / 1e6
             axes.plot(millions, scores.mean(axis=0), color=COLOURS.get(type_, "grey"), linewidth=1.3, label=type_)
             axes.fill_between(
@@ -307,14 +318,14 @@ def plot(members: Sequence[Kept]) -> Figure:
     return figure
 
 
-def _scores(curve: Mapping[str, np.ndarray], row: Row) -> Iterator[np.ndarray]:
-    kind = "-".join(part for part in (row.type, row.placement, row.noise) if part).replace("*", "_").replace("/", "_")
-    return (curve[f"Score/{kind}-s{seed}"] for seed in range(row.seeds))
+def _keys(row: Row) -> list[StudentKey]:
+    touch = None if row.type == NONE else PolicyTouch(row.type, row.placement, row.noise)
+    return [StudentKey(touch, seed) for seed in range(row.seeds)]
 
 
-def write_pages(folder: Path = KEPT, pages: tuple[Path, Path] = PAGES) -> list[Path]:
+def write_pages(folder: Path = RESULTS, pages: tuple[Path, Path] = PAGES) -> list[Path]:
     """Write tables between the markers of both pages, and the plots; return the files."""
-    runs = kept_runs(folder)
+    runs = all_results(folder)
     contents = {page: _between(page, text) for page, text in zip(pages, (summary(runs), sections(runs)), strict=True)}
     for series, members in _by_series(runs).items():
         png = io.BytesIO()
@@ -332,15 +343,15 @@ def _between(page: Path, text: str) -> bytes:
     return f"{before}{begin}\n\n{text}\n\n{end}{after}".encode()
 
 
-def _by_series(runs: Sequence[Kept]) -> dict[str, list[Kept]]:
+def _by_series(runs: Sequence[Results]) -> dict[str, list[Results]]:
     return {series: [run for run in runs if run.series == series] for series in dict.fromkeys(run.series for run in runs)}
 
 
-def _title(run: Kept, place: Place) -> str:
+def _title(run: Results, place: Place) -> str:
     return ", ".join(part for part in (run.networks, *place) if part)
 
 
-def _overrides(members: Sequence[Kept]) -> str:
+def _overrides(members: Sequence[Results]) -> str:
     lines = []
     for run in members:
         settings = ", ".join(f"`{name}={value}`" for name, value in run.run["overrides"].items())

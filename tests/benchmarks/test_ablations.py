@@ -26,9 +26,9 @@ def row(type_, score, half=0.3):
     return Row(type_, placement, "med", noise, 2, score, score - half, score + half, 0.9, 100, 8000, 5.0)
 
 
-def kept(scores, is_less_better=False, **halves):
+def results_of(scores, is_less_better=False, **halves):
     rows = {n: [row(name, pair[i], halves.get(name, 0.3)) for name, pair in scores.items()] for i, n in enumerate((200, 400))}
-    return ablations.Kept("made_up", {"is_less_better": is_less_better}, rows, {})
+    return ablations.Results("made_up", {"is_less_better": is_less_better}, rows, {})
 
 
 def worse(results):
@@ -38,25 +38,33 @@ def worse(results):
 def test_students_have_converged_if_twice_the_iterations_change_little():
     """5 % of 10.0 is 0.5."""
     for before, expected in ((9.51, True), (9.49, False), (10.49, True), (10.51, False)):
-        results = kept({"force": (before, 10.0)})
+        results = results_of({"force": (before, 10.0)})
         assert results.has_converged(results.rows[400][0], 400) is expected
         assert results.has_converged(results.rows[200][0], 200) is None
-    assert kept({"none": (0.0, 0.0)}).has_converged(row("none", 0.0), 400) is False, "it may not have begun to learn"
-    alone = ablations.Kept("made_up", {"is_less_better": False}, {300: [row("force", 1.0)], 400: [row("force", 1.0)]}, {})
+    assert results_of({"none": (0.0, 0.0)}).has_converged(row("none", 0.0), 400) is False, "it may not have begun to learn"
+    alone = ablations.Results("made_up", {"is_less_better": False}, {300: [row("force", 1.0)], 400: [row("force", 1.0)]}, {})
     assert alone.has_converged(alone.rows[400][0], 400) is None
 
 
 def test_converged_types_with_separate_intervals_are_worse():
     """`bool` still rises: nothing is said of it."""
-    assert worse(kept(SCORES)) == {"force": [], "depth": ["force"], "bool": [], "none": ["force", "depth"]}
-    assert worse(kept(SCORES, depth=1.6)) == {"force": [], "depth": [], "bool": [], "none": ["force", "depth"]}
-    assert worse(kept(SCORES, is_less_better=True))["force"] == ["depth", "none"]
+    assert worse(results_of(SCORES)) == {"force": [], "depth": ["force"], "bool": [], "none": ["force", "depth"]}
+    assert worse(results_of(SCORES, depth=1.6)) == {"force": [], "depth": [], "bool": [], "none": ["force", "depth"]}
+    assert worse(results_of(SCORES, is_less_better=True))["force"] == ["depth", "none"]
 
 
 def test_other_places_are_not_compared():
     tips = Row("depth", "tips", "med", "clean", 2, 1.0, 0.9, 1.1, 0.9, 100, 8000, 5.0)
     rows = {n: [row("force", 10.0), tips] for n in (200, 400)}
-    assert worse(ablations.Kept("made_up", {"is_less_better": False}, rows, {})) == {"force": [], "depth": []}
+    assert worse(ablations.Results("made_up", {"is_less_better": False}, rows, {})) == {"force": [], "depth": []}
+
+
+def test_one_seed_and_other_resolutions_are_not_compared():
+    """An interval of one seed knows nothing of seeds; students without touch are in each place of their resolution."""
+    for changes in ({"seeds": 1}, {"resolution": "high"}):
+        rows = {n: [row("force", 10.0), row("none", 1.0)._replace(**changes)] for n in (200, 400)}
+        results = ablations.Results("made_up", {"is_less_better": False}, rows, {})
+        assert worse(results) == {"force": [], "none": []}
 
 
 def test_a_thinned_curve_has_means_without_episodes_that_began_before():
@@ -69,9 +77,9 @@ def test_a_thinned_curve_has_means_without_episodes_that_began_before():
     starts = [{"spec": spec, "iteration": 0}, {"spec": spec, "iteration": 120}]
     rows = list(csv.DictReader(ablations._thinned(curve, starts).splitlines()))
     assert len(rows) == 60 and list(rows[0]) == ["samples", "seconds", "Score/a", "Score/b"]
-    assert [own["samples"] for own in rows[:2]] == ["40", "80"] and rows[-1]["seconds"] == "240"
-    assert [own["Score/a"] for own in (rows[0], rows[1], rows[29], rows[30], rows[31])] == ["", "6.5", "118.5", "", "126.5"]
-    assert {own["Score/b"] for own in rows} == {""}
+    assert [line["samples"] for line in rows[:2]] == ["40", "80"] and rows[-1]["seconds"] == "240"
+    assert [line["Score/a"] for line in (rows[0], rows[1], rows[29], rows[30], rows[31])] == ["", "6.5", "118.5", "", "126.5"]
+    assert {line["Score/b"] for line in rows} == {""}
 
 
 @pytest.mark.slow
@@ -93,7 +101,7 @@ def test_runs_of_tgdsl_distill_are_kept_and_compared(tmp_path, here, no_onnx):
         code, _, error = here(tmp_path, "distill", "task.yaml", *words)
         assert code == 0, error
         ablations.keep(tmp_path / f"run{iterations}", "small", {"teacher": None, "rest": None}, folder)
-    (results,) = ablations.kept_runs(folder)
+    (results,) = ablations.all_results(folder)
     assert sorted(results.rows) == [2, 4] and results.curves[4]["high"]["samples"].tolist() == [8.0, 16.0, 24.0, 32.0]
     assert [(own.type, own.resolution) for own in results.rows[4]] == [
         ("depth", "low"), ("none", "low"), ("depth", "high"), ("none", "high")
@@ -109,9 +117,12 @@ def test_runs_of_tgdsl_distill_are_kept_and_compared(tmp_path, here, no_onnx):
     assert [file.read_bytes() for file in files] == [file.read_bytes() for file in ablations.write_pages(folder, pages)]
     assert "### small" in pages[1].read_text() and (tmp_path / "docs/images/ablation_small.png").is_file()
 
-    made = json.loads((folder / "small" / "run.json").read_text())
-    (folder / "small" / "run.json").write_text(json.dumps(made | {"teacher": "other.pt"}))
+    record = json.loads((folder / "small" / "run.json").read_text())
+    (folder / "small" / "run.json").write_text(json.dumps(record | {"teacher": "other.pt"}))
     with pytest.raises(TgdslError, match=r"teacher other\.pt, this run has teacher\.pt"):
+        ablations.keep(tmp_path / "run4", "small", {"teacher": None, "rest": None}, folder)
+    (folder / "small" / "run.json").write_text(json.dumps(record | {"overrides": {"distill.epochs": "1"}}))
+    with pytest.raises(TgdslError, match=r"overrides .*epochs.*, this run has"):
         ablations.keep(tmp_path / "run4", "small", {"teacher": None, "rest": None}, folder)
 
 
@@ -125,7 +136,7 @@ def test_missing_results_are_named_and_nothing_is_written(tmp_path):
 
 
 def test_the_committed_pages_match_the_kept_results():
-    runs = ablations.kept_runs()
+    runs = ablations.all_results()
     for page, text in zip(ablations.PAGES, (ablations.summary(runs), ablations.sections(runs)), strict=True):
         assert page.read_bytes() == ablations._between(page, text), "run: python benchmarks/ablations.py page"
     images = sorted(file.stem for file in (ablations.ROOT / "docs" / "images").glob("ablation_*.png"))

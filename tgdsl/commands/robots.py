@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -118,12 +119,8 @@ class Freeze:
         with StatusLine() as progress:
             progress("placing taxels")
             spec, layouts = all_layouts(document, args.parsed_overrides(self.set), self.resolutions)
-        files = frozen_files(spec, layouts, self.out, Path(self.hand).name)
-        for path in files:
-            args.refuse_to_replace(path, self.force)
-        atomic_write_all(files)
-        print("\n".join(f"{name}: {layout.num_taxels} taxels" for name, layout in layouts.items()))
-        print("\n".join(map(str, reversed(files))))
+        counts = [f"{name}: {layout.num_taxels} taxels" for name, layout in layouts.items()]
+        _write_new(frozen_files(spec, layouts, self.out, Path(self.hand).name), self.force, counts)
 
 
 @dataclass(frozen=True)
@@ -151,11 +148,15 @@ class FromGates:
         saved = read_policy(self.policy)
         with StatusLine() as progress:
             spec, layouts = chosen_layout(saved, self.taxels, progress)
-        files = frozen_files(spec, layouts, self.out, saved.file.name)
-        for path in files:
-            args.refuse_to_replace(path, self.force)
-        atomic_write_all(files)
-        print("\n".join(map(str, reversed(files))))
+        _write_new(frozen_files(spec, layouts, self.out, saved.file.name), self.force)
+
+
+def _write_new(files: dict[Path, bytes], force: bool, notes: Sequence[str] = ()) -> None:
+    """Write files, none of which may be there already without `force`; print notes and the files, the last one first."""
+    for path in files:
+        args.refuse_to_replace(path, force)
+    atomic_write_all(files)
+    print("\n".join([*notes, *map(str, reversed(files))]))
 
 
 @dataclass(frozen=True)
