@@ -156,7 +156,7 @@ def fit_case(
     return result
 
 
-def gelsight(data: Path, out: Path | None, starts: int) -> None:
+def gelsight(data: Path, out: Path | None, only: str, starts: int) -> None:
     """Print the table of the GelSight's press and drag."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -176,7 +176,7 @@ def gelsight(data: Path, out: Path | None, starts: int) -> None:
             ("layer, both, offset", {**PRESSED, "friction": 0.15}, [press, drag], [*OF_LAYER, FRICTION], "offset"),
         ]  # fmt: skip
         normals, fits = np.tile([0.0, 0.0, 1.0], (len(places), 1)), dict[str, Fit]()
-        for label, skin, recordings, fit, reading in cases:
+        for label, skin, recordings, fit, reading in (case for case in cases if only in case[0]):
             sheet = skin_document(folder, places, normals, skin, BALL, 4e-3, 0.4e-3)
             options = {"reading": reading, "gain": True, "hold_out": "taxel", "starts": starts}
             fits[label] = fit_case(label, sheet, recordings, fit, out, **options)
@@ -212,7 +212,7 @@ def dome_recordings(data: Path, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     return pos[used], normal[used]
 
 
-def dome(data: Path, out: Path | None, starts: int) -> None:
+def dome(data: Path, out: Path | None, only: str, starts: int) -> None:
     """Print the table of the finite-element dome: the material fitted to the press predicts the drag."""
     with tempfile.TemporaryDirectory() as name:
         folder, fits = Path(name), dict[str, Fit]()
@@ -228,6 +228,8 @@ def dome(data: Path, out: Path | None, starts: int) -> None:
             "layer": (layer, [poisson, depth, thickness]),
         }
         for kernel, (skin, material) in cases.items():
+            if only not in kernel:
+                continue
             sheet = skin_document(folder, places, normals, {**skin, "enter": 0}, DOME_BALL, 4.5e-4, 9e-5)
             options = {"prefix": "dome-", "gain": True, "starts": starts}
             press = fit_case(f"{kernel}, press", sheet, folder / "press.npz", material, out, hold_out="blocks", **options)
@@ -262,7 +264,7 @@ def eflesh_recording(data: Path, run: str, contact: float, every: int, cycles: s
     }  # fmt: skip
 
 
-def eflesh(data: Path, out: Path | None, starts: int) -> None:
+def eflesh(data: Path, out: Path | None, only: str, starts: int) -> None:
     """Print the table of the eFlesh under a probe: the load by the robot's pose."""
     stiffness, exponent = "load.normal_stiffness=1e1:1e8", "load.depth_exponent=0.05:4"
     lattice = {"densification": 0.03, "depth_exponent": 0.3, "normal_stiffness": 30}
@@ -281,6 +283,8 @@ def eflesh(data: Path, out: Path | None, starts: int) -> None:
     with tempfile.TemporaryDirectory() as name:
         fits: dict[str, Fit] = {}
         for label, (law, recordings, fit, gain) in cases.items():
+            if only not in label:
+                continue
             sheet = probe_document(Path(name), law)
             options = {"prefix": "eflesh-", "gain": gain, "hold_out": "time", "folds": 10, "starts": starts}
             fits[label] = fit_case(label, sheet, recordings, fit, out, **options)
@@ -291,10 +295,11 @@ def main(
     which: Annotated[Literal["gelsight", "eflesh", "dome"], tyro.conf.arg(help="The data.")],
     data: Path,
     out: Path | None = None,
+    only: Annotated[str, tyro.conf.arg(help="Part of the names of the rows to fit; default: all.")] = "",
     starts: int = 1,
 ) -> None:
     """Fit sensors to recordings and print the errors."""
-    {"gelsight": gelsight, "eflesh": eflesh, "dome": dome}[which](data, out, starts)
+    {"gelsight": gelsight, "eflesh": eflesh, "dome": dome}[which](data, out, only, starts)
 
 
 if __name__ == "__main__":

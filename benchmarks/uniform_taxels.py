@@ -17,8 +17,11 @@ from jaxtyping import Float, Int
 from tgdsl.files.write import atomic_write_all
 from tgdsl.placement.freeze import frozen_files
 from tgdsl.rl.load import load_task
-from tgdsl.rl.sensors import GROUP, TaskSensors, compile_sensors
+from tgdsl.rl.sensors import GROUP, compile_sensors
 from tgdsl.rl.students.results import reduced_layout
+from tgdsl.scene.scene import scene_model
+from tgdsl.view.cameras import pose_of
+from tgdsl.view.markers import taxels_of
 
 
 def farthest(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " count"]:
@@ -29,19 +32,6 @@ def farthest(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " 
         distance = np.minimum(distance, np.linalg.norm(points - points[rows[-1]], axis=1))
         rows.append(int(distance.argmax()))
     return np.array(rows)
-
-
-def positions(sensors: TaskSensors) -> Float[np.ndarray, "n 3"]:
-    """Return the places of touch's taxels in the world, in the model's initial pose [m]."""
-    import mujoco
-
-    from tgdsl.scene.scene import scene_model
-
-    model, layout = scene_model(sensors.touch.plan.scene), sensors.groups[GROUP].layout
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    bodies = [model.body(layout.links[i].body).id for i in layout.link_id]
-    return data.xpos[bodies] + np.einsum("nij,nj->ni", data.xmat[bodies].reshape(-1, 3, 3), layout.pos)
 
 
 def main() -> None:
@@ -55,7 +45,8 @@ def main() -> None:
     options = parser.parse_args()
     loaded = load_task(options.task, {"touch": "depth", "placement": options.placement, "resolution": options.resolution})
     sensors = compile_sensors(loaded, "cpu")
-    points = positions(sensors)
+    model = scene_model(sensors.touch.plan.scene)
+    points = taxels_of(model, pose_of(model, None), sensors.groups[GROUP].layout).pos
     if not 0 < options.taxels <= len(points):
         parser.error(f"--taxels {options.taxels}: expected 1 to {len(points)}")
     rows = farthest(points, options.taxels)
