@@ -143,6 +143,9 @@ def test_the_layout_of_a_student_has_the_taxels_of_its_widest_gates(base, here):
     for options, message in refused:
         code, _, error = here(base, "layout", "from-gates", str(student), *options)
         assert code == 2 and message in error
+    elsewhere = teacher(base / "moved.pt", task, seen, gates=gates, overrides=overrides, task="gone/task.yaml")
+    code, _, error = here(base, "layout", "from-gates", str(elsewhere))
+    assert code == 2 and "moved.pt: its task, gone/task.yaml, is not here; run this in the folder where" in error
     (base / "sensors.yaml").write_text(sensors.replace("rows: 3, columns: 2", "rows: 2, columns: 3"))
     code, _, error = here(base, "layout", "from-gates", str(student))
     assert code == 2 and "student.pt: this policy feels with other taxels" in error

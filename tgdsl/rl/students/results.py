@@ -156,6 +156,8 @@ def chosen_layout(saved: PolicyFile, taxels: int | None, progress: Progress) -> 
     count = taxels or int((openings(torch.from_numpy(log_alpha)) > 0.0).sum())
     if not 0 < count <= len(log_alpha):
         raise PolicyError(f"{file}: {count or 'none'} of its {len(log_alpha)} taxels; give --taxels from 1 to {len(log_alpha)}")
+    if not Path(card["task"]).is_file():
+        raise PolicyError(f"{file}: its task, {card['task']}, is not here; run this in the folder where the student was taught")
     loaded = load_task(card["task"], card["overrides"])
     sensors = compile_sensors(loaded, "cpu", progress)
     check_card(saved, card["joints"], sensors.touch)
