@@ -179,9 +179,9 @@ def _there(modes: tuple[Modes, ...]) -> Tensor:
     return outer([(basis.vectors[:, 0] > 0).to(basis.vectors.dtype) for basis in modes], torch.mul)
 
 
-def exponents(rates: Sequence[Float[Tensor, "env row"]], modes: tuple[Modes, ...]) -> Cells:
-    """Return x = Σ aμ of the modes of a box, from a of each axis."""
-    return outer([rate[..., None] * basis.exponent for rate, basis in zip(rates, modes, strict=True)], torch.add)
+def squared_wavenumbers(step: Sequence[Float[Tensor, " row"]], modes: tuple[Modes, ...]) -> Float[Tensor, "row x y z"]:
+    """Return x/(αΔt) = Σ μ/Δ² of the modes of a box [1/m²], from Δ of each axis [m]."""
+    return outer([basis.exponent / (side * side)[:, None] for side, basis in zip(step, modes, strict=True)], torch.add)
 
 
 def semi_implicit(cells: Cells, x: Float[Tensor, "#env row x y z"], modes: tuple[Modes, ...]) -> Spread:
@@ -192,4 +192,6 @@ def semi_implicit(cells: Cells, x: Float[Tensor, "#env row x y z"], modes: tuple
 def outer(parts: list[Tensor], join) -> Tensor:  # type: ignore[no-untyped-def]
     """Return outer products or sums of values along x, y and z (…, x, y, z)."""
     x, y, z = parts
-    return join(join(x[..., :, None, None], y[..., None, :, None]), z[..., None, None, :])
+    # Expanded first: inductor writes a value of many reads to memory, and fuses it only with others of its shape.
+    x, y, z = torch.broadcast_tensors(x[..., :, None, None], y[..., None, :, None], z[..., None, None, :])
+    return join(join(x, y), z)

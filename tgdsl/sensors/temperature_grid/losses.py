@@ -128,10 +128,8 @@ def paper_step(
         constants: Constants from `lower`.
         dt: Δt [s].
     """
-    alpha = rows.diffusivity * dt
-    x = diffusion.exponents([dt * rate for rate in rows.rates], rows.modes)
-    x = torch.maximum(x, alpha[..., None, None, None] * least_squared_wavenumber())
-    spread = diffusion.semi_implicit(cells, x, rows.modes).gained
+    wavenumbers = diffusion.squared_wavenumbers(rows.boxes.step, rows.modes).clamp(min=least_squared_wavenumber())
+    spread = diffusion.semi_implicit(cells, (dt * rows.diffusivity)[..., None, None, None] * wavenumbers, rows.modes).gained
     heat = rows.conductivity / rows.diffusivity
     generated = torch.zeros_like(cells)
     if "paper_source" in constants:

@@ -174,7 +174,7 @@ def diffused(cells: Tensor, rows: Rows, constants: Constants, dt: Tensor) -> dif
 
 
 def _exponents(rows: Rows, dt: Tensor) -> Tensor:
-    return diffusion.exponents([dt * rate for rate in rows.rates], rows.modes)
+    return (dt * rows.diffusivity)[..., None, None, None] * diffusion.squared_wavenumbers(rows.boxes.step, rows.modes)
 
 
 def _joules(gained: Tensor, inverse: Tensor) -> Tensor:
