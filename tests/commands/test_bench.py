@@ -25,7 +25,7 @@ def test_bench_prints_a_table_and_writes_three_files(here, tmp_path):
     [
         (("--envs", "many"), "tgdsl: --envs many: expected whole numbers joined by commas, such as 1024,4096\n"),
         (("--envs", "0"), "tgdsl: environments that are timed: found 0, expected numbers of at least 1\n"),
-        (("--sensors", "dept"), 'tgdsl: there is no sensor "dept"; did you mean "depth"?\n'),
+        (("--sensors", "dept", "--envs", "1", "--repeats", "1"), 'tgdsl: there is no sensor "dept"; did you mean "depth"?\n'),
         (("--device", "abacus"), None),
         (("--states", "none.npz"), "tgdsl: none.npz: expected an .npz file of states: "),
         (("--out", "pad.yaml"), "tgdsl: pad.yaml/bench.csv: "),

@@ -5,6 +5,7 @@ import json
 import warnings
 from html.parser import HTMLParser
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -15,8 +16,10 @@ from tgdsl.errors import StateError, TgdslError
 from tgdsl.module.accuracy.states import narrowed, readings_of
 from tgdsl.report.bench.bench import Bench, Options, bench
 from tgdsl.report.bench.page import write_bench
+from tgdsl.report.bench.physics import coordinates
 from tgdsl.report.bench.results import rows_of
 from tgdsl.tuning.recording import load_recording, record, save_recording, varied
+from tgdsl.tuning.trials import Cost
 
 FEW = Options(num_envs=(3, 5), repeats=2)
 
@@ -217,13 +220,32 @@ BLOCKS = (
 )
 
 
-def test_sensors_that_read_blocks_do_not_change_the_physics(tmp_path):
+def physics_of(folder, more=""):
+    path = bench_document(folder)
+    path.write_text(path.read_text().replace("observations:", f"{more}\nobservations:"))
+    return bench(Bench(path, sensors=("physics",), state_envs=4, steps=9, options=FEW)).subjects[0]
+
+
+@pytest.fixture(scope="module")
+def physics(tmp_path_factory):
+    return physics_of(tmp_path_factory.mktemp("physics"))
+
+
+def test_sensors_that_read_blocks_do_not_change_the_physics(physics, tmp_path):
     """Even though the bench tries other time steps than theirs."""
-    path = bench_document(tmp_path)
-    text = path.read_text()
-    results = []
-    for document in (text, text.replace("observations:", f"{BLOCKS}\nobservations:")):
-        path.write_text(document)
-        subject = bench(Bench(path, sensors=("physics",), state_envs=4, steps=9, options=FEW)).subjects[0]
-        results.append([point.chosen for point in subject.points])
-    assert results[0] == results[1]
+    assert [point.chosen for point in physics_of(tmp_path, BLOCKS).points] == [point.chosen for point in physics.points]
+
+
+def test_physics_is_compared_with_a_finer_run(physics):
+    """A quarter of the time step: half the time step is nearer to it. The state is two angles or positions and two speeds."""
+    errors = {point.label: point.chosen.rms.value for point in physics.points}
+    assert 0 < errors["time step 1 ms"] < physics.own.chosen.rms.value < errors["time step 10 ms"]
+    assert physics.own.label.startswith("as written") and sum(point.is_own for point in physics.points) == 1
+    assert physics.own.cost == Cost(None, 0, 4 * 8, 4 * 8)
+
+
+def test_orientations_are_left_out_of_the_physics():
+    joints = ("<freejoint/>", '<joint type="ball"/>', '<joint type="hinge"/>', '<joint type="slide"/>')
+    bodies = "".join(f'<body>{joint}<geom size=".1"/></body>' for joint in joints)
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    assert coordinates(model) == ([0, 1, 2, 11, 12], ["position"] * 3 + ["angle", "position"])

@@ -54,7 +54,9 @@ def test_changed_errors_and_variants_are_named():
     assert "errors and counts are as in the earlier bench" not in comparison.lines()
 
 
-@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"rows": [{"subject": 1}]}', '{"rows": 3}', '{"rows": [3]}'])
+@pytest.mark.parametrize(
+    "text", ["{", "[]", "{}", '{"rows": [{"subject": 1}]}', '{"rows": 3}', '{"rows": {}}', '{"rows": [3]}']
+)
 def test_a_file_without_a_bench_is_named(tmp_path, text):
     (tmp_path / "b.json").write_text(text)
     with pytest.raises(TgdslError, match=r"b\.json: found no rows of a bench, expected the bench\.json of one"):

@@ -1,10 +1,12 @@
-"""The Pareto front of hand-placed points with intervals, and intervals of medians."""
+"""The Pareto front of hand-placed points with intervals, intervals of medians, and times of calls."""
 
 import numpy as np
 import pytest
+import torch
 
 from tgdsl.module.accuracy.errors import Interval
-from tgdsl.report.bench.results import dominates, front_of, median_of
+from tgdsl.report.bench import results
+from tgdsl.report.bench.results import dominates, front_of, median_of, times_of
 
 
 def point(time, error, half=0.1):
@@ -42,3 +44,18 @@ def test_intervals_of_medians_match_published_tables(count, low, high):
     """Ranks of the 95 % interval of a median, from tables of the sign test (e.g. 2 and 8 of nine)."""
     times = np.random.default_rng(0).permutation(np.arange(1.0, count + 1))
     assert median_of(times) == Interval((count + 1) / 2, low, high)
+
+
+def test_calls_take_turns_after_two_untimed_ones(monkeypatch):
+    now, order = 0.0, []
+
+    def call(name: str, seconds: list[float]) -> None:
+        nonlocal now
+        order.append(name)
+        now += seconds.pop(0)
+
+    monkeypatch.setattr(results.time, "perf_counter", lambda: now)
+    lasting = {"a": [9.0, 8.0, 1.0, 2.0, 3.0], "b": [9.0, 8.0, 4.0, 4.0, 5.0]}
+    calls = {name: lambda name=name: call(name, lasting[name]) for name in lasting}
+    assert times_of(calls, 3, torch.device("cpu")) == {"a": Interval(2, 1, 3), "b": Interval(4, 4, 5)}
+    assert order == ["a", "b"] * 5
