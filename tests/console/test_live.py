@@ -26,7 +26,7 @@ def test_a_terminal_is_drawn_over_at_most_once_per_period(monkeypatch):
     monkeypatch.setattr(module.time, "monotonic", lambda: now)
     stream = Terminal()
     monkeypatch.setattr("sys.stdout", stream)
-    live = LiveTable(period=0.1)
+    live = LiveTable()  # a period of 0.1 s
     live.show(["a", "b"])
     assert stream.getvalue() == "a\nb\n"
     now = 100.05

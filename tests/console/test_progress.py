@@ -8,6 +8,7 @@ import struct
 import subprocess
 import sys
 import termios
+import threading
 import time
 from pathlib import Path
 
@@ -108,9 +109,12 @@ def test_a_status_line_is_overwritten_and_wiped(monkeypatch):
 
 
 def test_short_work_prints_nothing_without_a_terminal():
-    stream = io.StringIO()
+    stream, before = io.StringIO(), set(threading.enumerate())
     with StatusLine(stream) as progress:
         progress("first")
+        assert all(thread.daemon for thread in set(threading.enumerate()) - before), (
+            "an unfinished line would keep Python running"
+        )
     assert stream.getvalue() == ""
 
 
@@ -151,10 +155,19 @@ def test_a_bar_prints_counts_without_a_terminal(monkeypatch):
     with Bar("stepping", 7, "step") as bar:
         bar.update()
         bar.update(2)
+        bar.update(0)
         wait_for(stream, "stepping")
         bar.set_description_str("drawing")
         wait_for(stream, "drawing")
     assert stream.getvalue() == "stepping: 3 of 7 steps\ndrawing\n"
+
+
+def test_a_bar_on_a_terminal_shows_its_new_name(monkeypatch):
+    screen = Terminal()
+    monkeypatch.setattr(sys, "stderr", screen)
+    with Bar("stepping", 7, "step") as bar:
+        bar.set_description("drawing")
+    assert screen.getvalue().startswith("\rstepping: ") and "\rdrawing: " in screen.getvalue()
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -184,6 +185,9 @@ def test_an_entry_cannot_run_code(place, tmp_path):
     np.savez(place / f"{key(0)}.npz", value=np.array([Marker(tmp_path / "ran")], dtype=object))
     np.testing.assert_array_equal(value_of(0), np.zeros(VALUES))
     assert not (tmp_path / "ran").exists()
+    with pytest.raises(ValueError, match="allow_pickle=False"):
+        cache.cached(key(1), lambda: Marker(tmp_path / "ran"), lambda made: {"value": np.array([made])}, dict)
+    assert entries_present() == {0}
 
 
 def test_a_file_unfinished_for_an_hour_is_abandoned(place):
@@ -193,3 +197,20 @@ def test_a_file_unfinished_for_an_hour_is_abandoned(place):
         (place / name).write_bytes(bytes(10))
         os.utime(place / name, (now - 3600 * hours,) * 2)
     assert [entry.file.name for entry in cache.entries()] == [".0123456789abcdef.npz"]
+
+
+@dataclass
+class Record:
+    """What `cached_record` keeps."""
+
+    values: np.ndarray
+
+
+def test_a_record_with_a_number_that_is_not_finite_is_computed_again(place):
+    place.mkdir()
+    np.savez(place / f"{key(0)}.npz", values=np.array([1.0, np.nan]))
+    for _ in range(2):
+        record = cache.cached_record(key(0), lambda: Record(np.array([1.0, 2.0])), Record)
+        np.testing.assert_array_equal(record.values, [1.0, 2.0])
+    with np.load(place / f"{key(0)}.npz") as archive:
+        np.testing.assert_array_equal(archive["values"], [1.0, 2.0])

@@ -119,5 +119,4 @@ def spelled(value: Any) -> str:
         return ", ".join(f"{key}: {spelled(part)}" for key, part in value.items())
     if isinstance(value, tuple):
         return ", ".join(map(spelled, value))
-    link, target = getattr(value, "link", None), getattr(value, "object", None)
-    return f"{link} – {target}" if link is not None and target is not None else str(value)
+    return f"{value.link} – {value.object}" if hasattr(value, "link") else str(value)
