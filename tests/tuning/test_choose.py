@@ -92,7 +92,8 @@ def test_the_stricter_sensor_decides_for_a_shared_object(tmp_path):
     document = chosen_document(tmp_path, depth_at("10 %"), depth_at("0.01 %").replace("depth:", "fine:"))
     plan = compile_plan(document)
     assert choose(document).changes == choose(chosen_document(tmp_path, depth_at("0.01 %"))).changes
-    assert any("object stone: as fine as fine needs" in line for line in plan.sensors[0].notes)
+    for sensor, is_moved in zip(plan.sensors, (True, False), strict=True):
+        assert any("object stone: as fine as fine needs" in line for line in sensor.notes) is is_moved
     assert len(plan.quantities["contact_depth"].queries) == 1
 
 
@@ -188,6 +189,12 @@ def test_both_halves_have_all_variants_of_objects():
     for num in (1, 2, 3, 5, 8):
         for half in halves(max(16, 2 * num)):
             assert set(np.arange(max(16, 2 * num))[half] % num) == set(range(num))
+
+
+def test_documents_without_the_word_are_not_loaded(tmp_path):
+    """Their mistakes are the compiler's to report."""
+    for document in (tmp_path / "none.yaml", {}, {"sensors": {"depth": {"rates": [1]}}, "robot": 3}):
+        assert choose(document) == choose(document, {"robot.model": "x.xml"}) == Choice()
 
 
 def test_a_compiler_without_a_simulator_refuses_accuracy(tmp_path):

@@ -169,6 +169,14 @@ def test_varied_controls_differ_between_environments_within_their_range():
     np.testing.assert_array_equal(samples, varied(controls, ranges, 6, seed=0))
 
 
+def test_varied_controls_sway_at_least_twice_in_a_run():
+    """Periods of 0.05 to 0.4 runs have 5 to 40 turning points; the peaks are 6 % of the control's range apart."""
+    samples = varied(np.ones((2000, 1)), np.array([[0.0, 5.0]]), 40, seed=0)[:, 1:, 0]
+    turns = (np.diff(np.sign(np.diff(samples, axis=0)), axis=0) != 0).sum(axis=0)
+    assert 5 <= turns.min() < 8 and 20 < turns.max() <= 40
+    np.testing.assert_allclose(np.ptp(samples, axis=0), 0.06 * 5.0, rtol=1e-3)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong", "message"),
