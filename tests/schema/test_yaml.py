@@ -103,8 +103,13 @@ def test_nesting_is_bounded():
     assert messages_of("[" * 60 + "]" * 60) == [f"f:1:52: {'[0]' * 51}: nested more than 50 deep"]
     loop: dict = {}
     loop["a"] = loop
-    source = yaml.from_mapping(loop, "<mapping>")
-    assert [problem.what for problem in source.problems] == ["nested more than 50 deep"]
+    deep: dict | int = 1
+    for _ in range(50):
+        deep = {"a": deep}
+    assert isinstance(deep, dict) and yaml.from_mapping(deep, "<mapping>").problems == []
+    for mapping in (loop, {"a": deep}):
+        source = yaml.from_mapping(mapping, "<mapping>")
+        assert [problem.what for problem in source.problems] == ["nested more than 50 deep"]
 
 
 def test_an_anchor_may_be_redefined():
