@@ -60,7 +60,7 @@ def test_the_phase_does_not_drift(build, rate, dt, every):
     memory = touch.memory.tensors(1, dt, touch.dtype, touch.device)
     phase, step, sampled_calls = torch.zeros(1), torch.tensor(dt), []
     for call in range(100_000):
-        now = touch.memory.clock.nows({**memory, "clock/age": torch.tensor([call]), "s:sample/phase": phase}, step)["s"]
+        now = touch.memory.clock.nows({**memory, "clock/step": torch.tensor([call]), "s:sample/phase": phase}, step)["s"]
         assert now.is_sample is not None and now.period is not None
         if now.is_sample.item():
             sampled_calls.append(call)
@@ -227,4 +227,4 @@ def test_the_clock_counts_calls_and_episodes(build):
     clock = touch.memory.clock
     assert clock.get_buffer("step").tolist() == [7, 7, 7]
     assert clock.get_buffer("episode").tolist() == [2, 0, 1]
-    assert clock.get_buffer("age").tolist() == [2, 7, 4]
+    assert clock.get_buffer("begun").tolist() == [5, 0, 3]

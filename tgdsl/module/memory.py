@@ -28,6 +28,7 @@ from tgdsl.tensors.torch_internals import HookedModule, held_buffers, num_writes
 
 Tensors = dict[str, Tensor]
 Window = Float[Tensor, "env step channel row"]
+COUNTS = ("step", "episode", "begun")  # buffers `clock/<name>` of each environment
 WINDOW, KEPT = "history/", "kept/"  # buffers `history/<reading>`, a window; `kept/<reading>`, the last reading
 SHARED = ("clock/seed", "clock/first_env", "clock/periods", "clock/keys")  # buffers that all environments share
 EVERY = 16  # on a GPU one call in so many is checked: a small kernel takes as long to launch as a module's
@@ -38,7 +39,7 @@ class Clock(HookedModule):
     """Counts calls and episodes of each environment. It has no buffers before `start`, or if no sensor needs it.
 
     Buffers, all int64: `seed`, `first_env` (number of the first environment, counted over all processes); per environment,
-    (env,): `step` (calls so far), `episode` (resets), `age` (calls since the last reset). In the module's dtype: `ages`
+    (env,): `step` (calls so far), `episode` (resets), `begun` (`step` at the last reset). In the module's dtype: `ages`
     (env, call), time from each call to the last one [s], the last call first; `time` (env,), from the reset to the last call
     [s].
     """
@@ -61,14 +62,14 @@ class Clock(HookedModule):
     @property
     def num_envs(self) -> int | None:
         """Number of environments; None before the start."""
-        return len(self.get_buffer("age")) if hasattr(self, "age") else None
+        return len(self.get_buffer("step")) if hasattr(self, "step") else None
 
     def start(self, num_envs: int, calls: int, like: Tensor) -> None:
         """Begin to count. `calls`: length of the longest ring [calls]; `like`: the module's device and dtype."""
         whole = {"device": like.device, "dtype": torch.int64}
         for name in ("seed", "first_env"):
             self.register_buffer(name, torch.zeros((), **whole))
-        for name in ("step", "episode", "age"):
+        for name in COUNTS:
             self.register_buffer(name, torch.zeros(num_envs, **whole))
         if any(sensor.is_timed for sensor in self._sensors):
             self.register_buffer("time", like.new_zeros(num_envs))
@@ -103,7 +104,7 @@ class Clock(HookedModule):
         """Begin a new episode in the environments of a mask."""
         if self.num_envs is not None:
             self.get_buffer("episode").add_(chosen)
-            self.get_buffer("age").masked_fill_(chosen, 0)
+            self.get_buffer("begun").copy_(torch.where(chosen, self.get_buffer("step"), self.get_buffer("begun")))
 
     def tensors(self) -> Tensors:
         """Return the buffers as `clock/<name>`."""
@@ -117,7 +118,7 @@ class Clock(HookedModule):
         """
         if not self.is_wanted:
             return {}
-        step, age = memory["clock/step"][:, None], memory["clock/age"][:, None]
+        step, age = memory["clock/step"][:, None], age_of(memory)[:, None]
         ages = memory["clock/ages"] + dt if "clock/ages" in memory and dt is not None else None
         drawn: dict[str, Mapping[int, Stream]] = {}
         if self._drawing:
@@ -138,7 +139,7 @@ class Clock(HookedModule):
             return UNTIMED
         assert dt is not None
         count = max(sensor.substeps, 1)
-        age, step_dt = memory["clock/age"][:, None], dt / count if count > 1 else dt
+        age, step_dt = age_of(memory)[:, None], dt / count if count > 1 else dt
         time = torch.where(age == 0, 0.0, memory["clock/time"][:, None] + (substep + 1) * step_dt)
         is_first = (age == 0) & (substep == 0)
         stream = None
@@ -150,9 +151,9 @@ class Clock(HookedModule):
     @staticmethod
     def after(clock: Mapping[str, Tensor], dt: Tensor | None) -> Tensors:
         """Return the counts after a call."""
-        counts = {name: clock[name] + 1 for name in ("clock/step", "clock/age") if name in clock}
+        counts = {"clock/step": clock["clock/step"] + 1} if "clock/step" in clock else {}
         if "clock/time" in clock and dt is not None:
-            counts["clock/time"] = torch.where(clock["clock/age"] == 0, 0.0, clock["clock/time"] + dt)
+            counts["clock/time"] = torch.where(age_of(clock) == 0, 0.0, clock["clock/time"] + dt)
         if "clock/ages" in clock and dt is not None:
             ages = clock["clock/ages"]
             counts["clock/ages"] = torch.cat([torch.zeros_like(ages[:, :1]), ages[:, :-1] + dt], dim=1)
@@ -166,7 +167,7 @@ class Clock(HookedModule):
         with torch.no_grad():
             self.get_buffer("seed").fill_(self._seed)
             self.get_buffer("first_env").fill_(rank * self.num_envs if self._first_env is None else self._first_env)
-            for name in ("step", "episode", "age"):
+            for name in COUNTS:
                 self.get_buffer(name).zero_()
         self._set_keys()
 
@@ -179,13 +180,13 @@ class Clock(HookedModule):
         """Allocate buffers for the loaded counts, and continue with their seed; do nothing if `Memory` reports errors."""
         if errors:
             return
-        age, ages = state_dict.get(f"{prefix}age"), state_dict.get(f"{prefix}ages")
-        if self.is_wanted and isinstance(age, Tensor):
+        step, ages = state_dict.get(f"{prefix}step"), state_dict.get(f"{prefix}ages")
+        if self.is_wanted and isinstance(step, Tensor):
             calls = ages.shape[-1] if isinstance(ages, Tensor) else 0
             held = self.get_buffer("ages").shape[-1] if hasattr(self, "ages") else 0
-            if (len(age), calls) != (self.num_envs, held):  # else captured graphs keep using the buffers
+            if (len(step), calls) != (self.num_envs, held):  # else captured graphs keep using the buffers
                 with torch.inference_mode(False):
-                    self.start(len(age), calls, self.home)
+                    self.start(len(step), calls, self.home)
         load()
         if self.num_envs is not None:
             self._seed, self._first_env = int(self.get_buffer("seed")), int(self.get_buffer("first_env"))
@@ -194,8 +195,13 @@ class Clock(HookedModule):
 
 def _env(memory: Mapping[str, Tensor]) -> Tensor:
     """Return the numbers of the environments that are read, (env,), counted over all processes."""
-    age = memory["clock/age"]
-    return torch.arange(age.shape[0], device=age.device) + memory["clock/first_env"]
+    step = memory["clock/step"]
+    return torch.arange(step.shape[0], device=step.device) + memory["clock/first_env"]
+
+
+def age_of(memory: Mapping[str, Tensor]) -> Tensor:
+    """Return the number of calls since each environment's reset, (env,); 0 at the first one."""
+    return memory["clock/step"] - memory["clock/begun"]
 
 
 def _drop(module: HookedModule, prefix: str) -> None:
@@ -302,7 +308,7 @@ class Memory(HookedModule):
         if not isinstance(memory, Mapping):
             problem = f"memory: found {type(memory).__name__}"
             raise StateError(f"{problem}, expected `initial_memory`, or what the step before returned")
-        clock = ("clock/age", "clock/step") if self.clock.is_wanted else ()
+        clock = [f"clock/{name}" for name in COUNTS] if self.clock.is_wanted else []
         if missing := [name for name in (*self.planned, *clock) if name not in memory]:
             raise StateError(f'memory: found no "{missing[0]}"; expected `initial_memory`, or what the step before returned')
         for name, planned in self.planned.items():
@@ -359,7 +365,7 @@ class Memory(HookedModule):
         self.clock.free()
 
     def reset(self, chosen: Tensor) -> None:
-        """Begin a new episode in the environments of a mask; noise and history restart by the clock's `age`."""
+        """Begin a new episode in the environments of a mask; noise and history restart at the next call."""
         for path, rest in self._restarted.items():
             buffer = self.get_buffer(path)
             buffer.masked_fill_(broadcast_over(chosen, buffer), rest)
@@ -370,9 +376,9 @@ class Memory(HookedModule):
         result = dict(memory)
         for path, rest in self._restarted.items():
             result[path] = memory[path].masked_fill(broadcast_over(chosen, memory[path]), rest)
-        if "clock/age" in memory:
+        if "clock/step" in memory:
             result["clock/episode"] = memory["clock/episode"] + chosen
-            result["clock/age"] = memory["clock/age"].masked_fill(chosen, 0)
+            result["clock/begun"] = torch.where(chosen, memory["clock/step"], memory["clock/begun"])
         return result
 
     def on_move(self, fn: Callable[[Tensor], Tensor], move: Callable[[], object]) -> None:
@@ -386,9 +392,9 @@ class Memory(HookedModule):
         Buffers of the right shape are reused: captured graphs refer to them.
         """
         loaded = {path: state_dict[prefix + path] for path in self.planned if isinstance(state_dict.get(prefix + path), Tensor)}
-        age = state_dict.get(f"{prefix}clock.age")
-        if loaded or age is not None:
-            errors.extend(self._misfits(loaded, age, prefix))
+        counts = {name: state_dict[key] for name in COUNTS if (key := f"{prefix}clock.{name}") in state_dict}
+        if loaded or counts:
+            errors.extend(self._misfits(loaded, counts, prefix))
         if errors:
             return  # nothing is loaded, in the clock neither
         with torch.inference_mode(False):
@@ -398,14 +404,14 @@ class Memory(HookedModule):
         self._last, self._is_filled = {}, False  # the replaced state returned them
         load()
 
-    def _misfits(self, found: Mapping[str, Tensor], age: Tensor | None, prefix: str) -> list[str]:
+    def _misfits(self, found: Mapping[str, Tensor], counts: Mapping[str, Tensor], prefix: str) -> list[str]:
         """Return the errors of a state to load: missing parts, and parts of another shape than planned."""
         missing = [path for path in self.planned if path not in found]
-        missing += ["clock.age"] if self.clock.is_wanted and age is None else []
+        missing += [f"clock.{name}" for name in COUNTS if name not in counts] if self.clock.is_wanted else []
         wrong = [f'"{prefix}{path}" is missing, other state is there' for path in missing]
-        counts = {len(value) for value in [*found.values(), *([] if age is None else [age])] if value.ndim}
-        if len(counts) > 1:
-            wrong.append(f'the parts of "{prefix}" are of {sorted(counts)} environments')
+        sizes = {len(value) for value in [*found.values(), *counts.values()] if value.ndim}
+        if len(sizes) > 1:
+            wrong.append(f'the parts of "{prefix}" are of {sorted(sizes)} environments')
         for path, value in found.items():
             shape, expected = tuple(value.shape), tuple(self.planned[path].shape)
             if shape[value.ndim - len(expected) :] != expected:

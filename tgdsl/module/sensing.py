@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.errors import TgdslError, listed
-from tgdsl.module.memory import WINDOW, Clock, pushed, reduced
+from tgdsl.module.memory import WINDOW, Clock, age_of, pushed, reduced
 from tgdsl.plan import tree
 from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedSensor
@@ -133,7 +133,7 @@ def sense(
         updated |= new
         for reading in sensor.windows:
             assert sensor.history is not None
-            window = pushed(memory[f"{WINDOW}{reading.name}"], outputs[reading.name], memory["clock/age"])
+            window = pushed(memory[f"{WINDOW}{reading.name}"], outputs[reading.name], age_of(memory))
             updated[f"{WINDOW}{reading.name}"] = window
             outputs[reading.name] = reduced(window, sensor.history.reduce)
         readings |= outputs
