@@ -10,10 +10,10 @@ Errors are relative to the largest magnitude of a channel in the batch. Contact 
   the CPU. 99.9 % of the readings must agree to 1e-5. Readings jump at an edge between two faces, at the threshold of a contact
   and where an anchor slips, and float32 may fall on the other side. The elastomer's limit is 3e-5: it reads displacements of
   at most some millimetres as differences of positions of some centimetres.
-- `states` steps both simulators from the same float32 positions and velocities. Poses and velocities must agree to 1e-5.
-  Rounding decides whether a barely touching contact exists: all contacts must be equal in 95 % of the environments. There the
-  forces, at which solvers stop, must agree to 1e-3 in 99 % and to 0.1 in all: the force of a contact that is about to slide
-  or to separate jumps.
+- `states` makes a physics step in both simulators from the same float32 positions and velocities. Poses and velocities
+  must agree to 1e-5. Rounding decides whether a barely touching contact exists: all contacts must be equal in 95 % of the
+  environments. There the forces, at which solvers stop, must agree to 1e-3 in 99 % and to 0.1 in all: the force of a contact
+  that is about to slide or to separate jumps.
 - `runs` makes 200 control steps in each simulator, with a cube at rest and squeezed; the grip differs between environments.
   It compares means over the last 50 steps: the vertical force on the hand, at rest the cube's weight; the cube's height; the
   magnitude of each reading. They must agree to 2 % and 0.1 mm. A steady grip depends little on its history, except through
@@ -150,29 +150,27 @@ def check_modules(options: argparse.Namespace) -> None:
 
 
 def check_states(options: argparse.Namespace) -> None:
-    """Step both simulators from the same positions and velocities."""
+    """Make a physics step in both simulators from the same positions and velocities."""
     touch, other = module(options, options.device), module(options, "cpu", torch.float64)
-    sim = simulation(touch, options)
-    cpu = BatchSimulation(other, options.num_envs, keyframe="rest")
+    sim = simulation(touch, options, substeps=SUBSTEPS)
+    cpu = BatchSimulation(other, options.num_envs, keyframe="rest", substeps=SUBSTEPS)
     sim.warp_model.opt.tolerance.fill_(cpu.model.opt.tolerance)
     results: Series = {}
     expected: Series = {}
     shares: list[float] = []
     strength = np.linspace(0.3, 1.2, options.num_envs)
-    for i, control in enumerate(grips(sim.model, strength, INSTANTS * EVERY * SUBSTEPS)):
-        is_compared = i % (EVERY * SUBSTEPS) == EVERY * SUBSTEPS - 1
-        if is_compared:
-            for name in STATE:
-                getattr(cpu.batch, name)[...] = sim.arrays[name].cpu().numpy()
-            cpu.step(control)
-        sim.step(control)
-        if is_compared:
-            state, reference = sim.state(), cpu.state()
-            is_equal = (num_contacts(state) == num_contacts(reference)).all(axis=1)
-            shares.append(is_equal.mean())
-            for source, series in ((state, results), (reference, expected)):
-                values = fields(source, touch.inputs.fields)
-                append(series, {name: value[is_equal] if name in FORCES else value for name, value in values.items()})
+    for i, control in enumerate(grips(sim.model, strength, INSTANTS * EVERY)):
+        if i % EVERY < EVERY - 1:
+            sim.step(control)
+            continue
+        for name in STATE:
+            getattr(cpu.batch, name)[...] = sim.arrays[name].cpu().numpy()
+        state, reference = (next(each.substates(control)) for each in (sim, cpu))
+        is_equal = (num_contacts(state) == num_contacts(reference)).all(axis=1)
+        shares.append(is_equal.mean())
+        for source, series in ((state, results), (reference, expected)):
+            values = fields(source, touch.inputs.fields)
+            append(series, {name: value[is_equal] if name in FORCES else value for name, value in values.items()})
     sim.check()
     print(f"  environments with the same contacts in both: {np.mean(shares):.2%}")
     require(float(np.mean(shares)) >= 0.95, "contacts differ in too many environments")
