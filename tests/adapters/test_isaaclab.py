@@ -158,6 +158,17 @@ def test_only_a_reset_environment_is_read_again(isaaclab, tmp_path):
     assert sensor.data["load"][1].any()
 
 
+def test_contacts_return_after_a_reset_with_an_update_period(isaaclab, tmp_path):
+    sensor = make(isaaclab, document(tmp_path, load=LOAD), update_period=0.004)
+    Manager.host.push()
+    steps(sensor, 6)
+    assert sensor.data["load"][1].any()
+    sensor.reset(env_ids=[1])
+    assert not sensor.data["load"][1].any()
+    steps(sensor, 2)
+    assert sensor.data["load"][1].any()
+
+
 def test_readings_stay_within_their_update_period(isaaclab, tmp_path):
     sensor = make(isaaclab, document(tmp_path), update_period=0.004)
     Manager.host.push()

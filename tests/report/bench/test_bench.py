@@ -14,11 +14,12 @@ from benched_pads import bench_document
 import tgdsl
 from tgdsl.errors import StateError, TgdslError
 from tgdsl.module.accuracy.states import narrowed, readings_of
+from tgdsl.module.state import SceneState
 from tgdsl.report.bench.bench import Bench, Options, bench
 from tgdsl.report.bench.page import write_bench
 from tgdsl.report.bench.physics import coordinates
 from tgdsl.report.bench.results import rows_of
-from tgdsl.tuning.recording import load_recording, record, save_recording, varied
+from tgdsl.tuning.recording import Recording, load_recording, record, save_recording, varied
 from tgdsl.tuning.trials import Cost
 
 FEW = Options(num_envs=(3, 5), repeats=2)
@@ -149,6 +150,16 @@ def test_saved_states_load_unchanged(folder, work, report, tmp_path):
         assert before_saving.dt == after_loading.dt
 
 
+def test_states_by_hand_load_unchanged(tmp_path):
+    pos = torch.arange(12.0, dtype=torch.float64).reshape(2, 2, 1, 3)
+    states = tuple(SceneState(body_pos=pos[i], dt=0.01) for i in range(2))
+    save_recording(Recording(states, {"body": ("cube",)}, "by hand"), tmp_path / "s.npz")
+    loaded = load_recording(tmp_path / "s.npz")
+    assert loaded.source == f"{tmp_path / 's.npz'}: 2 steps in 2 environments" and loaded.names == {"body": ["cube"]}
+    for state, expected in zip(loaded.states, pos, strict=True):
+        assert torch.equal(state.body_pos, expected) and state.body_quat is None and state.dt == 0.01
+
+
 @pytest.mark.slow
 def test_narrowed_states_read_the_same(work):
     """A module of one sensor reads the same from the states as the module of all sensors."""
@@ -203,11 +214,11 @@ def test_states_of_another_document_are_refused(work, report, tmp_path):
         bench(Bench(work.document, states=tmp_path / "other.npz", sensors=("depth",), options=FEW))
 
 
-@pytest.mark.parametrize("content", [b"", b"no zip", None])
+@pytest.mark.parametrize("content", [b"", b"no zip", {"ctrl": 3}, {"body_pos": (2, 2, 1, 3)}, {"names:body": 1}])
 def test_files_without_states_are_refused(tmp_path, content):
     path = tmp_path / "s.npz"
-    if content is None:
-        np.savez(path, ctrl=np.zeros(3))
+    if isinstance(content, dict):
+        np.savez(path, **{name: np.zeros(shape) for name, shape in content.items()})
     else:
         path.write_bytes(content)
     with pytest.raises(StateError, match=r"s\.npz: expected "):
