@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from ruamel.yaml import YAML
 
 ROOT = Path(__file__).parents[2]
 
@@ -58,6 +59,13 @@ def test_turning_is_the_angle_about_the_vertical(env):
     assert drop(env).tolist() == [False, True]
     env.reset(env_ids=torch.tensor([1]))
     assert turning(env).angle.tolist() == turning(env).reached.tolist() == [0.0, 0.0] and not drop(env).any()
+
+
+def test_the_sensor_is_that_of_tgdsls_task():
+    from tgdsl.adapters.mjlab_tasks import DOCUMENT
+
+    palm = YAML(typ="safe").load(ROOT / "examples" / "tasks" / "palm.yaml")
+    assert DOCUMENT["sensors"]["touch"] == palm["sensors"]["touch"]
 
 
 def test_mjlabs_script_trains_the_task(tmp_path):
