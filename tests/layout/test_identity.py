@@ -95,6 +95,7 @@ def test_columns_that_one_table_lacks_are_not_compared():
 
 def test_an_id_is_of_each_name_and_place_but_of_no_group():
     assert re.fullmatch("[0-9a-f]{32}", taxels_id(LAYOUT))
+    assert taxels_id(LAYOUT) == 2 * "0c03947df9e11363", "files of policies hold ids, and must keep matching"
     assert taxels_id(changed(groups={})) == taxels_id(changed()) == taxels_id(LAYOUT)
     others = [moved(name, 1, by) for name, by in (("pos", 1e-3), ("normal", 0.1), ("tangent", 0.1), ("radius", 1e-3))]
     others += [moved("cell", 1, 1), changed(link_id=np.array([0, 0, 1, 1]))]
