@@ -1,6 +1,7 @@
 """Fits to recordings made with known parameters: values, clocks, intervals, warnings, and the fitted document."""
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,8 +9,10 @@ import torch
 from recorded_presses import LAG, TRUE, document, motion, readings, recording
 
 import tgdsl
-from tgdsl.calibration.model import InfeasibleError, Model
+from tgdsl.calibration import fit as fitting
+from tgdsl.calibration.model import InfeasibleError, Model, Parameter
 from tgdsl.calibration.recordings import velocities
+from tgdsl.console.progress import silent
 from tgdsl.errors import TgdslError
 
 FIT = ["touch.normal_stiffness", "touch.depth_exponent"]
@@ -193,6 +196,14 @@ def test_unidentified_parameters_are_named(path):
     assert "touch.normal_damping: no reading depends on it; leave it out" in fit.warnings
     short = tgdsl.calibrate(path, arrays, ["touch.normal_stiffness", "touch.depth_exponent=0.8:1.1"], starts=1)
     assert any(text.startswith("touch.depth_exponent: at the end of its range, 1.1") for text in short.warnings)
+
+
+def test_an_interval_ends_with_its_range():
+    """1.96 standard deviations of 0.3 about 0.95 reach from 0.362 of the range to its end: 0.638, below the limit of 0.9."""
+    problem = SimpleNamespace(model=SimpleNamespace(parameters=[Parameter("touch.k", 15.0, 10.0, 20.0, "", False)]))
+    solution, uncertainty = SimpleNamespace(x=np.array([0.95])), SimpleNamespace(sigma=np.array([0.3]))
+    (found,) = fitting._parameters(problem, solution, uncertainty, "none", 0, silent)
+    assert (found.value, found.low, found.high) == pytest.approx((19.5, 13.62, 20.0)) and found.is_identified
 
 
 def test_a_pose_offset_is_found_within_its_prior(path):

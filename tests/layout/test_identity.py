@@ -145,3 +145,4 @@ def test_the_same_taxels_in_another_order_are_known_by_place_whatever_the_sign_o
     order, signs = [0, 2, 1, 3], np.where(LAYOUT.pos == 0, -1.0, 1.0)
     other = changed(**{name: getattr(LAYOUT, name)[order] for name in ("normal", "cell")}, pos=(LAYOUT.pos * signs)[order])
     assert ", the same ones in another order; the first is row 1" in message(other)
+    assert ", the same ones in another order" in message(dataclasses.replace(other, pos=other.pos + 2e-5))  # 20 µm from there
