@@ -72,6 +72,7 @@ SHOTS = {
     "tasks/in_hand_repose": Shot("item", 0.24, 60, -50, "in_hand_repose", 0.7),
     "tasks/in_hand_repose_sharpa": Shot("item", 0.28, 60, -50),
     "tasks/screwdriver": Shot("screwdriver", 0.34, 225, -30, "screwdriver", overrides=(("grasps.num", 4),)),
+    "tasks/screwdriver_held": Shot("screwdriver", 0.34, 225, -30, "screwdriver_held", overrides=(("grasps.num", 4),)),
     "tasks/grip_force": Shot("item", 0.28, 270, -45, "grip_force"),
     "tasks/hot_ball": Shot("ball0", 0.9, 60, -30, overrides=(("touch", "depth"), ("placement", "hand")), hides="bin"),
     "tasks/find_ridge": Shot("ridge", 0.12, 60, -15, "find_ridge"),

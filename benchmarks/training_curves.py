@@ -50,7 +50,7 @@ PANELS: dict[str, dict[str, str]] = {
         "rotate/w": "w",
         "rotate/w_again": "w again",
     },
-    "screwdriver: rad/s while upright": {"screwdriver/s1": "s1"},
+    "screwdriver: rad/s while upright": {"screwdriver/s1": "s1", "screwdriver/held": "held, weak drives: the last stage"},
     "in_hand_repose: goals in a row": {"repose/r1": "r1", "repose/xy": "about x and y: by 20°, 35°, then 45°"},
     "grip_force: RMS of force error over command": {"grip_force/x": "x", "grip_force/x_again": "x again"},
 }
