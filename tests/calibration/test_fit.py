@@ -10,10 +10,12 @@ from recorded_presses import LAG, TRUE, document, motion, readings, recording
 
 import tgdsl
 from tgdsl.calibration import fit as fitting
+from tgdsl.calibration import picture as picturing
 from tgdsl.calibration.model import InfeasibleError, Model, Parameter
 from tgdsl.calibration.recordings import velocities
 from tgdsl.console.progress import silent
 from tgdsl.errors import TgdslError
+from tgdsl.view.style import new_figure
 
 FIT = ["touch.normal_stiffness", "touch.depth_exponent"]
 
@@ -32,6 +34,8 @@ def test_parameters_and_clock_are_found(fitted):
     stiffness, exponent = (fitted.parameters[name] for name in FIT)
     assert stiffness.low < 900 < stiffness.high and exponent.low < 1.3 < exponent.high
     assert exponent.high - exponent.low < 0.06
+    for parameter, bounds in ((stiffness.parameter, (0, 5000)), (exponent.parameter, (0.1, 10))):  # a decade around 500 and 1
+        assert (parameter.low, parameter.high) == pytest.approx(bounds)
     assert fitted.nuisances["<arrays>: clock of touch"] == pytest.approx(-LAG, abs=2e-3)
     (error,) = fitted.errors
     assert error.error == pytest.approx(error.floor, rel=0.1) and error.held_out < 1.1 * error.error
@@ -62,7 +66,7 @@ def test_a_linear_parameter_is_solved_for(fitted):
 
 def test_the_jacobian_of_the_projected_residual_matches_differences(fitted):
     problem, x = fitted.problem, fitted.solution.x
-    jacobian = problem.jacobian(x, problem.weights(), (1, 2))
+    jacobian = problem.jacobian(x, problem.weights(), (1, 2), are_fixed=False)
     for j, column in zip((1, 2), jacobian.T, strict=True):
         step = 1e-3 * np.eye(3)[j]
         slope = (
@@ -86,6 +90,15 @@ def test_a_fit_can_be_printed_and_plotted(fitted, tmp_path):
     text = str(fitted)
     assert "touch.depth_exponent" in text and "held out" in text and "warning: touch.normal_stiffness" in text
     assert fitted.plot(tmp_path / "fit.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_plot_over_time_has_the_largest_rows():
+    measured = np.array([0.1, 5.0, -7.0, 1.0]).reshape(1, 4, 1)
+    part = SimpleNamespace(target=SimpleNamespace(value=measured, time=np.zeros(1)), weight=np.ones_like(measured))
+    left, right = new_figure(6, 3).subplots(1, 2)
+    picturing._lines((left, right), part, measured + 0.5, None, "N")
+    assert [line.get_ydata().tolist() for line in left.lines] == [[-7], [-6.5], [5], [5.5], [1], [1.5]]
+    assert [line.get_ydata().tolist() for line in right.lines[:3]] == [[0.5]] * 3
 
 
 def test_changed_parameters_read_like_a_compiled_document(path):

@@ -206,7 +206,7 @@ class Problem:
         columns, value = self.parts[i].columns * root[:, None], value * root
         return value - columns @ np.linalg.lstsq(columns, value, rcond=None)[0]
 
-    def jacobian(self, x: np.ndarray, weights: Weights, free: Sequence[int], are_fixed: bool = False) -> np.ndarray:
+    def jacobian(self, x: np.ndarray, weights: Weights, free: Sequence[int], are_fixed: bool) -> np.ndarray:
         """Return the derivatives of the residuals by some unknowns, by forward differences within the bounds."""
         base, columns = self.solve(x, weights, are_fixed).residual, []
         for j in free:

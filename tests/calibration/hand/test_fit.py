@@ -432,4 +432,5 @@ def test_a_picture_shows_the_errors_of_each_finger_below(tmp_path):
     _, below = drawing({"index": fit}, "a.npz").axes
     offsets = np.concatenate([np.asarray(points.get_offsets()) for points in below.collections])
     np.testing.assert_allclose(offsets, np.stack([fit.force.T.ravel(), fit.error.T.ravel()], axis=1), atol=1e-12)
+    assert [line.get_ydata() for line in below.lines] == [[0, 0]]
     assert picture({"index": fit}, tmp_path / "fit.png", "a.npz").read_bytes().startswith(b"\x89PNG")
