@@ -11,6 +11,7 @@ from recorded_presses import LAG, TRUE, document, motion, readings, recording
 import tgdsl
 from tgdsl.calibration import fit as fitting
 from tgdsl.calibration import picture as picturing
+from tgdsl.calibration import problem as problems
 from tgdsl.calibration.model import InfeasibleError, Model, Parameter
 from tgdsl.calibration.recordings import velocities
 from tgdsl.console.progress import silent
@@ -86,10 +87,23 @@ def test_the_fitted_document_predicts_new_recordings(path, fitted):
         fitted.document(path.parent / "elsewhere" / "fitted.yaml")
 
 
-def test_a_fit_can_be_printed_and_plotted(fitted, tmp_path):
+def test_a_fit_can_be_printed_and_plotted(fitted, tmp_path, monkeypatch):
     text = str(fitted)
     assert "touch.depth_exponent" in text and "held out" in text and "warning: touch.normal_stiffness" in text
     assert fitted.plot(tmp_path / "fit.png").read_bytes().startswith(b"\x89PNG")
+    drawn = []
+    monkeypatch.setattr(picturing, "save_figure", lambda figure, path: drawn.append(figure) or path)
+    fitted.plot(tmp_path / "fit.png")
+    left, right = (panel.get_title(loc="left") for panel in drawn[0].axes)
+    assert left.startswith(f"<arrays>: touch, relative RMSE {fitted.errors[0].error:.3f}") and right.startswith("residual")
+
+
+def test_scales_need_channels_along_axes():
+    output = SimpleNamespace(name="touch", channels=("force_x", "depth"))
+    model = SimpleNamespace(module=SimpleNamespace(outputs=[output]))
+    target = SimpleNamespace(reading="touch", channels=(0, 1), value=np.zeros((1, 2, 2)), weight=np.ones((1, 2, 2)))
+    with pytest.raises(TgdslError, match="reading: scale: force_x, depth are not along x, y, z; expected offset or affine"):
+        problems._part(0, target, "scale", np.eye(3)[:2], model)
 
 
 def test_a_plot_over_time_has_the_largest_rows():

@@ -6,8 +6,9 @@ from recorded_presses import document, motion, recording
 from scipy.spatial.transform import Rotation
 
 import tgdsl
-from tgdsl.calibration.recordings import load_recording, velocities
+from tgdsl.calibration.recordings import _Reader, load_recording, velocities
 from tgdsl.errors import SpecError, TgdslError
+from tgdsl.plan.inputs import Inputs
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +81,23 @@ def test_mistakes_are_named_by_key(pressed, change, message):
     change(arrays)
     with pytest.raises(SpecError, match=message):
         read(touch, arrays)
+
+
+@pytest.mark.parametrize(("key", "place"), [("time", 3), ("body_quat", (7, 1, 0))])
+def test_an_infinite_number_gives_one_message(pressed, key, place):
+    """It is not also out of order, or of another length than 1."""
+    _, touch, arrays = pressed
+    with pytest.raises(SpecError) as raised:
+        read(touch, arrays | {key: with_value(arrays[key], place, np.inf)})
+    assert [problem.path for problem in raised.value.problems] == [key]
+
+
+def test_joints_are_read_in_the_order_of_the_module():
+    inputs = Inputs(("joint_pos",), (), (), {}, 0, joints=("bend", "turn"))
+    arrays = {"joint_pos": np.array([[1.0, 2.0], [3.0, 4.0]]), "joints": np.array(["turn", "bend"])}
+    reader = _Reader("press.npz", arrays, inputs, {})
+    np.testing.assert_array_equal(reader._field("joint_pos", 2), [[2, 1], [4, 3]])
+    assert not reader.problems
 
 
 def test_all_mistakes_are_reported_at_once(pressed, tmp_path):

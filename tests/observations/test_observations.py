@@ -7,7 +7,7 @@ import torch
 import tgdsl
 from tgdsl.errors import SpecError, TgdslError
 from tgdsl.observations import observations
-from tgdsl.observations.observations import OfReading, PerLink, register
+from tgdsl.observations.observations import AggBoolObservation, CopObservation, OfReading, PerLink, register
 from tgdsl.schema.document import json_schema
 
 SCENE = """
@@ -113,6 +113,14 @@ def test_agg_bool_counts_more_than_two(touch, readings):
     np.testing.assert_array_equal(groups["links"][:, 6:].numpy(), [[1, 0], [0, 0], [0, 0]])
     np.testing.assert_array_equal(groups["any"].numpy(), [[1, 1], [1, 0], [0, 1]])
     np.testing.assert_array_equal(groups["plain"][:, 6:].numpy(), readings["contact"][:, :, 0].numpy())
+    assert AggBoolObservation(type="agg_bool", of="contact").features == (("contact of more than 2 taxels", "1", "", 1.0),)
+
+
+def test_centres_of_pressure_are_metres_and_newtons():
+    names = [*(f"force_{axis}" for axis in "xyz"), *(f"centre of pressure, {axis}" for axis in "xyz")]
+    units = [*3 * ["N"], *3 * ["m"]]
+    features = tuple((name, unit, "link", 1.0) for name, unit in zip(names, units, strict=True))
+    assert CopObservation(type="cop", of="touch").features == features
 
 
 def test_counts_propagate_nan(touch, readings):

@@ -226,7 +226,7 @@ def _bounded(path: str, start: float, quantity: Quantity, usual: Usual | None, s
         usual_high = usual.high if usual is not None else math.inf
         reach = 10**DECADES * (abs(start) or 1.0)
         high = min(most, max(min(usual_high, reach), start))
-        low = max(least, -reach) if least != 0 else 0.0
+        low = max(least, -reach)
         if quantity.gt == 0:
             low = min(max(usual.low if usual is not None else 0.0, start / 10**DECADES), start)
     if not low <= start <= high:
