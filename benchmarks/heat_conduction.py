@@ -86,7 +86,7 @@ def check(mirrored: Mirrored, exact: Exact, cells: Tensor, rate: Tensor) -> None
     num = mirrored.num
     k = torch.pi * torch.arange(num)
     smooth = (exact.modes._replace(exponent=(k * k).expand(LINKS, -1)),) * 3
-    x = diffusion.exponents([rate[None]] * 3, smooth)
-    expected = cells + diffusion.semi_implicit(cells, x, smooth).gained
+    x = rate[:, None, None, None] * diffusion.squared_wavenumbers([torch.ones(LINKS)] * 3, smooth)
+    expected = cells + diffusion.semi_implicit(cells, x[None], smooth).gained
     torch.testing.assert_close(mirrored(cells), expected, rtol=0, atol=1e-5)
     torch.testing.assert_close(exact(cells).sum(dim=(2, 3, 4)), cells.sum(dim=(2, 3, 4)), rtol=0, atol=1e-4 * num**1.5)
