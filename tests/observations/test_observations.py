@@ -123,6 +123,13 @@ def test_centres_of_pressure_are_metres_and_newtons():
     assert CopObservation(type="cop", of="touch").features == features
 
 
+def test_a_hands_own_taxels_are_120_on_each_of_five_fingers(tmp_path):
+    """Three components of each, and one bit."""
+    terms = {"raw": [{"type": "taxel_counts"}, {"type": "taxel_saturated"}]}
+    counts, saturated = tgdsl.compile(observation_document(tmp_path, terms)).observations["raw"]
+    assert (counts.slice.stop, saturated.slice.stop) == (1800, 1800 + 600)
+
+
 def test_counts_propagate_nan(touch, readings):
     readings["contact"][0, 0] = torch.nan
     assert touch.observe(readings)["links"][0, 6].isnan()
