@@ -104,3 +104,12 @@ def test_ellipsoid_derivative_with_respect_to_its_size(size):
         assert torch.autograd.gradcheck(
             distance, torch.tensor(size, dtype=torch.float64, requires_grad=True), eps=1e-9, atol=1e-4
         )
+
+
+@pytest.mark.parametrize("least", range(3))
+def test_the_reference_takes_the_positive_side_of_planes_of_symmetry(least):
+    """From an ellipsoid's centre, both ends of its shortest axis are nearest."""
+    size, axis = np.roll([0.01, 0.02, 0.03], least), np.eye(3)[least]
+    distance, gradient = signed_distance("ellipsoid", size, np.zeros(3))
+    assert distance == pytest.approx(-0.01)
+    np.testing.assert_array_equal(gradient, axis)
