@@ -147,6 +147,7 @@ def test_saving_loading_and_explaining(tmp_path):
     assert again.observations == touch.observations
     plain = json.loads(touch.plan.to_json())
     assert plain["format"] == FORMAT
+    assert list(plain) == sorted(plain)
     assert plain["inputs"]["joints"] == list(ACTUATED)
     text = touch.explain()
     assert f"  joints  {', '.join(ACTUATED)}\n  actuators  {', '.join(ACTUATORS)}\n" in text
