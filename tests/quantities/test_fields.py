@@ -24,7 +24,7 @@ from tgdsl.geometry.planes import split
 from tgdsl.quantities import moment_fields
 from tgdsl.quantities.moment_fields import bake_field, sample_cloud, sample_points, surface_area
 from tgdsl.quantities.moment_sums import MomentField, field_moments
-from tgdsl.surfaces.quadrature import outer_surface
+from tgdsl.surfaces.quadrature import Pieces, outer_surface
 
 
 @pytest.fixture(autouse=True)
@@ -101,6 +101,32 @@ def test_the_area_of_a_union_leaves_out_inner_surfaces():
 
 
 @pytest.mark.slow
+def pieces(pos: list[list[float]], normal: list[list[float]]) -> Pieces:
+    """Return pieces without extent, of 1, 2, … m²."""
+    at = np.array(pos, dtype=float)
+    return Pieces(np.repeat(at[:, None], 3, axis=1), at, np.array(normal, dtype=float), np.arange(1.0, len(at) + 1))
+
+
+def test_pieces_in_a_cube_of_half_the_spacing_share_a_point():
+    """Cubes of 1 m from the lowest place: of 0, 0.5 and 0.9 m, and of 1.1 m."""
+    points = pieces([[x, 0, 0] for x in (0.0, 0.5, 0.9, 1.1)], [[0, 0, 1]] * 4).quadrature(2.0)
+    np.testing.assert_allclose(points.area, [1 + 2 + 3, 4])
+    np.testing.assert_allclose(points.pos, [[(2 * 0.5 + 3 * 0.9) / 6, 0, 0], [1.1, 0, 0]])
+
+
+def test_random_points_are_ordered_by_the_side_they_are_on():
+    """Two sides face along z, up and down; their pieces alternate along x."""
+    both = pieces([[x, 0, x % 2] for x in range(8)], [[0, 0, 2 * (x % 2) - 1] for x in range(8)])
+    is_up = both.random_by_side(200, seed=0)[:, 2] > 0.5
+    assert (np.diff(is_up) != 0).sum() == 1
+
+
+def test_pieces_of_a_sphere_are_on_it_and_not_on_its_chords():
+    ball = outer_surface([geom_of("sphere", [R])], R)
+    np.testing.assert_allclose(np.linalg.norm(ball.pos, axis=1), R, rtol=1e-12)
+    np.testing.assert_allclose(ball.normal, ball.pos / R, atol=1e-12)
+
+
 def test_derivatives_with_respect_to_the_radius():
     """Slopes of sums equal differences of sums at R ± δ; those of the field are within a few percent."""
     pos, step = places(200), 2e-4
