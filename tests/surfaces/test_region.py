@@ -6,6 +6,7 @@ from oracles.setups.solids import ball, box, surface_of
 from surfaces import HERE, error_of, placement
 
 from tgdsl.placement.sample.sample import sample
+from tgdsl.surfaces.region import _rim
 
 REGIONS = [
     ({"facing": [0, 0, 2], "within": "30 deg"}, lambda pos, normal: normal[:, 2] >= np.cos(np.radians(30)) - 1e-9),
@@ -47,3 +48,11 @@ def test_unknown_and_excluded_geoms_are_named():
     assert str(error_of(surface, placement("poisson", count=3, region=nothing))) == (
         "`exclude` leaves none of the geoms that `include` takes; exclude less"
     )
+
+
+def test_the_rim_of_a_sphere_is_where_edges_cross_it():
+    """Of a right triangle, the legs cross the unit sphere about their corner; the hypotenuse is √2 away."""
+    triangle = np.array([[[0.0, 0, 0], [2, 0, 0], [0, 2, 0]]])
+    rim = _rim(triangle, np.zeros(3), 1.0)[0]
+    found = rim[np.isfinite(rim).all(axis=1)]
+    np.testing.assert_allclose(found[np.argsort(found[:, 0])], [[0, 1, 0], [1, 0, 0]], atol=1e-12)
