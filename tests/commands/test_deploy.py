@@ -90,6 +90,7 @@ def test_wrong_arguments_are_refused(base, here):
         (*policy, "--kp", "3"): "tgdsl: --speed, --current-limit: missing; a hand moves only with a speed, a current limit",
         (*policy, "--episodes", "0"): "tgdsl: 0 episodes of None s, expected at least 1, and more than 0 s\n",
         (*policy, "--set", "episode=0"): "--set episode=0: episode: ",
+        (*policy, "--goal", "1", "--out", "task.yaml/made.npz"): "tgdsl: task.yaml/made.npz: ",
         (*policy, "--calibration", "none.yaml", "--source", "emulator"): "none.yaml: cannot read this file",
     }
     for arguments, message in cases.items():
