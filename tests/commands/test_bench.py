@@ -3,6 +3,10 @@
 import pytest
 from benched_pads import bench_document
 
+from tgdsl.commands.report import Bench
+from tgdsl.report.bench.bench import Bench as Work
+from tgdsl.report.bench.bench import Options
+
 FEW = ("--steps", "6", "--state-envs", "2", "--repeats", "1", "--envs", "2,3", "--sensors", "depth")
 
 
@@ -18,6 +22,14 @@ def test_bench_prints_a_table_and_writes_three_files(here, tmp_path):
     code, output, error = here(tmp_path, "bench", "pad.yaml", "-o", "again", "--states", "states.npz", *FEW)
     assert code == 0, error
     assert output.startswith("pad.yaml: states.npz: 6 steps in 2 environments\n")
+
+
+def test_the_command_has_the_defaults_of_the_function():
+    work, options = Work({}), Options()
+    expected = (work.state_envs, work.steps, work.substeps, options.repeats, options.compiled, options.seed)
+    command = Bench()
+    assert (command.state_envs, command.steps, command.substeps, command.repeats, command.compiled, command.seed) == expected
+    assert tuple(map(int, command.envs.split(","))) == options.num_envs
 
 
 @pytest.mark.parametrize(
