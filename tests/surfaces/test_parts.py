@@ -38,3 +38,10 @@ def test_a_sphere_with_a_small_hole_is_solid(hole, is_solid):
     mesh = trimesh.creation.revolve(profile, sections=64)
     shell = outer_shell(surface_of(mesh, ball(0.002, subdivisions=1)))
     assert shell.is_solid.tolist() == ([True] if is_solid else [False, True])
+
+
+def test_repeated_faces_count_once():
+    cube = box([0.02, 0.03, 0.04])
+    repeated = trimesh.Trimesh(cube.vertices, np.concatenate([cube.faces, cube.faces[:3]]), process=False)
+    shell = outer_shell(surface_of(repeated))
+    assert len(shell.surface.faces) == 12 and shell.is_solid.all()
