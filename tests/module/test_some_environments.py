@@ -348,7 +348,7 @@ def test_loaded_state_takes_the_modules_dtype(original, dtype):
         )
 
 
-@pytest.mark.parametrize("missing", ["memory.clock.begun", "memory.s:noise/lag", "memory.history/stack"])
+@pytest.mark.parametrize("missing", ["memory.clock.reset_step", "memory.s:noise/lag", "memory.history/stack"])
 @pytest.mark.parametrize("strict", [True, False])
 def test_an_incomplete_state_is_refused(original, missing, strict):
     source, touch = copy.deepcopy(original), copy.deepcopy(original)

@@ -227,4 +227,4 @@ def test_the_clock_counts_calls_and_episodes(build):
     clock = touch.memory.clock
     assert clock.get_buffer("step").tolist() == [7, 7, 7]
     assert clock.get_buffer("episode").tolist() == [2, 0, 1]
-    assert clock.get_buffer("begun").tolist() == [5, 0, 3]
+    assert clock.get_buffer("reset_step").tolist() == [5, 0, 3]

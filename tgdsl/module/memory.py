@@ -28,7 +28,7 @@ from tgdsl.tensors.torch_internals import HookedModule, held_buffers, num_writes
 
 Tensors = dict[str, Tensor]
 Window = Float[Tensor, "env step channel row"]
-COUNTS = ("step", "episode", "begun")  # buffers `clock/<name>` of each environment
+COUNTS = ("step", "episode", "reset_step")  # buffers `clock/<name>` of each environment
 WINDOW, KEPT = "history/", "kept/"  # buffers `history/<reading>`, a window; `kept/<reading>`, the last reading
 SHARED = ("clock/seed", "clock/first_env", "clock/periods", "clock/keys")  # buffers that all environments share
 EVERY = 16  # on a GPU one call in so many is checked: a small kernel takes as long to launch as a module's
@@ -39,7 +39,7 @@ class Clock(HookedModule):
     """Counts calls and episodes of each environment. It has no buffers before `start`, or if no sensor needs it.
 
     Buffers, all int64: `seed`, `first_env` (number of the first environment, counted over all processes); per environment,
-    (env,): `step` (calls so far), `episode` (resets), `begun` (`step` at the last reset). In the module's dtype: `ages`
+    (env,): `step` (calls so far), `episode` (resets), `reset_step` (`step` at the last reset). In the module's dtype: `ages`
     (env, call), time from each call to the last one [s], the last call first; `time` (env,), from the reset to the last call
     [s].
     """
@@ -104,7 +104,7 @@ class Clock(HookedModule):
         """Begin a new episode in the environments of a mask."""
         if self.num_envs is not None:
             self.get_buffer("episode").add_(chosen)
-            self.get_buffer("begun").copy_(torch.where(chosen, self.get_buffer("step"), self.get_buffer("begun")))
+            self.get_buffer("reset_step").copy_(torch.where(chosen, self.get_buffer("step"), self.get_buffer("reset_step")))
 
     def tensors(self) -> Tensors:
         """Return the buffers as `clock/<name>`."""
@@ -201,7 +201,7 @@ def _env(memory: Mapping[str, Tensor]) -> Tensor:
 
 def age_of(memory: Mapping[str, Tensor]) -> Tensor:
     """Return the number of calls since each environment's reset, (env,); 0 at the first one."""
-    return memory["clock/step"] - memory["clock/begun"]
+    return memory["clock/step"] - memory["clock/reset_step"]
 
 
 def _drop(module: HookedModule, prefix: str) -> None:
@@ -378,7 +378,7 @@ class Memory(HookedModule):
             result[path] = memory[path].masked_fill(broadcast_over(chosen, memory[path]), rest)
         if "clock/step" in memory:
             result["clock/episode"] = memory["clock/episode"] + chosen
-            result["clock/begun"] = torch.where(chosen, memory["clock/step"], memory["clock/begun"])
+            result["clock/reset_step"] = torch.where(chosen, memory["clock/step"], memory["clock/reset_step"])
         return result
 
     def on_move(self, fn: Callable[[Tensor], Tensor], move: Callable[[], object]) -> None:

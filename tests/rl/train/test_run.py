@@ -127,6 +127,7 @@ def test_a_resumed_run_does_not_repeat_noise(tmp_path, monkeypatch):
     restore(other, state, run._folder.checkpoint)
     clock = other.env.touch.memory.clock
     assert torch.equal(clock.episode, old_clock.episode + 1) and torch.equal(clock.step, old_clock.step + 1)
+    assert torch.equal(clock.reset_step, old_clock.step)
     fewer, _ = small_learner(tmp_path, num_envs=2, noise="noisy")
     restore(fewer, state, run._folder.checkpoint)
     assert torch.equal(torch.get_rng_state(), state["processes"][0]["cpu"])

@@ -146,7 +146,7 @@ def test_a_fault_in_substates_starts_one_episode(tmp_path, simulator):
     for state in states:
         touch(state)
     assert touch.memory.clock.get_buffer("episode").tolist() == [0, 1, 0]
-    assert touch.memory.clock.get_buffer("begun").tolist() == [0, 4, 0]
+    assert touch.memory.clock.get_buffer("reset_step").tolist() == [0, 4, 0]
 
 
 @BOTH

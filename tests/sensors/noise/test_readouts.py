@@ -64,7 +64,7 @@ def test_a_clean_readout_computes_no_noise(build):
     assert not clean.state_dict() and not clean.has_state
 
 
-CLOCK = {f"memory.clock.{name}" for name in ("seed", "first_env", "step", "episode", "begun")}
+CLOCK = {f"memory.clock.{name}" for name in ("seed", "first_env", "step", "episode", "reset_step")}
 OWN_BUFFERS = {
     "radius_noise": ([], True, False),
     "gain": ([], True, False),
