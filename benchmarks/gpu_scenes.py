@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 import tgdsl
+from tgdsl.module.memory import COUNTS
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.sensors import KINDS as TGDSL_KINDS
@@ -332,7 +333,7 @@ def bytes_of(touch: TactileModule) -> Bytes:
         size = value[:1].numel() * value.element_size() if value.ndim else 0
         planned = next((s.state[name] for s in touch.plan.sensors if s.name == sensor), None)
         if planned is None:
-            sizes["state"] += size if path in ("clock/episode", "clock/age") else 0
+            sizes["state"] += size if path.removeprefix("clock/") in COUNTS else 0
         elif planned.past:
             ring_calls = max(ring_calls, value.shape[1])
             sizes["ring"] += size // value.shape[1]

@@ -62,16 +62,16 @@ class TestBytes:
 
     def test_noise_keeps_hysteresis_drift_and_counts(self, tmp_path):
         size = bytes_of(module_of("kinematic-noisy", tmp_path))
-        assert size.state == 100 * 6 * 3 * 4 + 8
-        assert size.moved == 105 + 2400 + 2 * 7208
-        assert size.per_taxel == 24 + 72 + 0.08
+        assert size.state == 100 * 6 * 3 * 4 + 3 * 8
+        assert size.moved == 105 + 2400 + 2 * 7224
+        assert size.per_taxel == 24 + 72 + 0.24
 
     def test_a_ring_of_three_calls_is_held_whole_and_accessed_at_three_entries(self, tmp_path):
         size = bytes_of(module_of("kinematic-full", tmp_path))
         assert (size.ring_calls, size.ring_entry) == (3, 2400)
-        assert size.moved == 105 + 2400 + 2 * 7208 + 3 * 2400
-        assert size.held == 105 + 2400 + 7208 + 3 * 2400
-        assert (size.per_taxel, size.ring_per_taxel) == (24 + 72 + 0.08, 3 * 24)
+        assert size.moved == 105 + 2400 + 2 * 7224 + 3 * 2400
+        assert size.held == 105 + 2400 + 7224 + 3 * 2400
+        assert (size.per_taxel, size.ring_per_taxel) == (24 + 72 + 0.24, 3 * 24)
 
     def test_an_elastomer_tracks_each_point_in_four_numbers(self, tmp_path):
         size = bytes_of(module_of("elastomer-500-points", tmp_path))
@@ -249,7 +249,7 @@ def test_a_dry_run_measures_writes_and_draws(tmp_path, capsys):
         assert 0 <= row.error <= 1e-5
         assert min(row.graph, row.plain, row.copy) > 0
     noisy = next(row for row in rows if row.key == ("kinematic-noisy", 3))
-    assert noisy.moved == 3 * (105 + 2400 + 2 * 7208)
+    assert noisy.moved == 3 * (105 + 2400 + 2 * 7224)
     for command in (
         ["table", str(results)],
         ["plot", str(results), "--out", str(tmp_path / "images")],
