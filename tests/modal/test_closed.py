@@ -27,6 +27,11 @@ def test_sound_meshes_keep_their_volume():
     assert volume(surface_of(thin_box(0.1, 0.002))) == pytest.approx(CUBE - 0.096**3)
 
 
+def test_a_tiny_mesh_far_from_its_frame_keeps_its_volume():
+    """10 µm across, 10 m away: whether a mesh is flat depends on its shape alone."""
+    assert volume(surface_of(box((1e-5, 1e-5, 1e-5), at=(10.0, 0.0, 0.0)))) == pytest.approx(1e-15, rel=1e-6)
+
+
 def test_triangles_with_separate_corners_are_joined():
     """As STL files store them, and slightly apart."""
     mesh = box((0.1, 0.1, 0.1))

@@ -7,8 +7,9 @@ from oracles.setups.solids import ball, bending, box, roots, surface_of
 
 from tgdsl.fields.materials import MATERIALS
 from tgdsl.modal import analysis as spectra
+from tgdsl.modal import cells
 from tgdsl.modal.analysis import analysed
-from tgdsl.modal.elasticity import ALONG, on_grid
+from tgdsl.modal.elasticity import ALONG, Elements, on_grid
 from tgdsl.modal.modes import Modes, ShapeModes, interpolated, of_groups
 
 LENGTH, HEIGHT, WIDTH = 0.4, 0.006, 0.01
@@ -87,6 +88,20 @@ def test_the_stated_error_of_interpolation_holds(mesh, monkeypatch, tmp_path):
     error = np.sqrt(((np.abs(shares) - np.abs(exact)) ** 2).mean(axis=0))
     assert result.shapes.error.max() < 0.03
     assert error.max() < max(3 * result.shapes.error.max(), 0.01)
+
+
+def test_a_grid_has_the_fields_of_the_elements_at_their_nodes():
+    """Of any field, in every cell: each node of the elements is one of the grid's."""
+    vertices, faces = cells.closed(surface_of(box((1.0, 1.0, 1.0))))
+    lines = (np.linspace(-0.5, 0.5, 5),) * 3
+    filled, crossings = cells.filled(vertices, faces, lines, 3, 1e-6)
+    elements = Elements.of(filled)
+    fields = np.random.default_rng(0).standard_normal((3 * len(elements.pos), 2))
+    grid = on_grid(elements, crossings, lines, fields)
+    place = (elements.pos - grid.low) / grid.step
+    assert place == pytest.approx(np.rint(place), abs=1e-9)
+    node = np.ravel_multi_index(tuple(np.rint(place).astype(int).T), tuple(grid.num))
+    assert grid.value[node] == pytest.approx(fields.reshape(-1, 3, 2), abs=1e-6), "rounded to float32"
 
 
 def test_shares_average_to_one_over_the_surface():
