@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 from noisy_modules import EVERY_KNOB, EXAMPLE, document, felt_state
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import tgdsl
 from tgdsl.errors import StateError
@@ -34,6 +35,22 @@ def test_steps_read_the_same_as_calls(noisy):
     assert module_memory.keys() == memory.keys() and all(
         torch.equal(module_memory[name], memory[name]) for name in module_memory
     )
+
+
+def test_noise_and_rates_copy_no_memory(noisy):
+    """A copy protects memory from kernels that write in place, and nothing does so there."""
+    copied = set()
+
+    class Copies(TorchDispatchMode):
+        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+            if func is torch.ops.aten.clone.default:
+                copied.add(args[0].data_ptr())
+            return func(*args, **(kwargs or {}))
+
+    state, memory = felt_state(noisy, 4, 0), noisy.initial_memory(4, 0.01)
+    with Copies():
+        noisy.step(state, memory)
+    assert not [name for name, value in memory.items() if value.data_ptr() in copied]
 
 
 def test_steps_of_every_kind_read_the_same_as_calls():
