@@ -76,7 +76,7 @@ class PlannedHistory:
 
     length: int
     reduce: Literal["stack", "last", "median", "mean"]
-    view: bool = False
+    view: bool
 
 
 @dataclass(frozen=True, eq=False)
