@@ -1,5 +1,8 @@
 """`tgdsl bench`: output, files and error messages."""
 
+import io
+import sys
+
 import pytest
 from benched_pads import bench_document
 
@@ -69,6 +72,22 @@ def test_oracles_and_hard_cases_need_no_document(here, tmp_path, monkeypatch):
     monkeypatch.setattr(filters, "STRENGTH", 0.6)  # only in the closed form
     code, output, error = here(tmp_path, "bench", "--oracles", "-o", "out")
     assert code == 2 and error == "tgdsl: 1 results are not as they should be; they are marked in out\n" and "✗" in output
+
+
+def test_oracles_count_their_cases_on_a_terminal(here, tmp_path, monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    from oracles import report
+
+    monkeypatch.setattr(report, "CASES", [case for case in report.CASES if case.name == "filters.maxwell_step()"] * 2)
+    monkeypatch.setattr("oracles.sheet.write_sheet", lambda sheet, out: [])
+    monkeypatch.setattr(sys, "stderr", screen := Terminal())
+    code, output, _ = here(tmp_path, "bench", "--oracles", "-o", "out")
+    assert code == 0 and "2 of 2 hold" in output
+    counts = [line.partition(" ")[0] for line in screen.getvalue().split("\r") if "oracles: " in line]
+    assert list(dict.fromkeys(counts)) == ["0/2", "1/2", "2/2"]
 
 
 def test_an_installed_package_says_that_oracles_need_a_clone(here, tmp_path, monkeypatch):

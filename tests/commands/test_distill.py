@@ -252,13 +252,21 @@ def test_minutes_limit_each_start_and_are_summed(base, here, monkeypatch):
 
 
 def test_changes_since_the_teacher_are_printed_once(base, here):
-    """Sensing of students is no change."""
+    """Sensing of students is no change; a changed sensor and the scene are, before the first resolution begins."""
+    for name, before, now in (
+        ("sensors.yaml", "max_range: 10 cm", "max_range: 11 cm"),
+        ("scene.xml", 'mass=".1"', 'mass=".2"'),
+    ):
+        text = (base / name).read_text()
+        assert text.count(before) == 1
+        (base / name).write_text(text.replace(before, now))
     arguments = (*TEACHER, "--types", "none", "--seeds", "1", "--envs", "2", "--episodes", "0", "--iterations", "1", *SMALL)
     other = ("--set", "rewards.spin=3", "--set", "placement=all", "--resolutions", "low,high")
     code, out, error = here(base, "distill", "task.yaml", *arguments, *other)
     assert code == 0, error
-    changes = [line for line in out.splitlines() if "changed" in line]
-    assert changes == ["changed since the teacher was learned: rewards.spin: 2.0, now 3.0"]
+    lines = ["rewards.spin: 2.0, now 3.0", "sensors.yaml: sensors.gap.max_range: 0.1, now 0.11", "the scene's bodies"]
+    changes = [f"changed since the teacher was learned: {line}" for line in lines]
+    assert out.splitlines()[:3] == changes and out.count("changed") == 3
 
 
 def test_refused_arguments_leave_a_run_unchanged(base, here):

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from small_tasks import small_task
 
+from tgdsl.errors import TgdslError
+
 RECORDING = "expected a recording of tgdsl run, or a log of tgdsl hand record"
 
 
@@ -48,3 +50,17 @@ def test_a_recording_must_have_steps_and_fit_its_document(tmp_path, here):
         assert code == 2 and message in error, error
     code, _, error = here(tmp_path, "export-dataset", "out/readings.npz", "--fps", "0")
     assert code == 2 and "--fps 0: expected more than 0" in error
+
+
+def test_a_hand_acts_in_real_time_unless_lockstep_is_asked_for(tmp_path, here, monkeypatch):
+    asked = []
+
+    def refuse(*_, lockstep, **options):
+        asked.append(lockstep)
+        raise TgdslError("no hand")
+
+    monkeypatch.setattr("tgdsl.rl.deploying.deploy.Deployment", refuse)
+    for more in ((), ("--lockstep",)):
+        result = here(tmp_path, "export-dataset", "task.yaml", "--policy", "p.pt", "--source", "emulator", *more)
+        assert result == (2, "", "tgdsl: no hand\n")
+    assert asked == [False, True]

@@ -7,6 +7,7 @@ import pytest
 import soundfile
 
 from tgdsl.commands.documents import Listen
+from tgdsl.console.bar import Bar
 from tgdsl.errors import TgdslError
 
 SCENE = """<mujoco><option timestep=".001"/><default><geom solref=".006 .5"/></default><worldbody>
@@ -50,9 +51,13 @@ def test_a_run_is_written_as_files_and_a_picture(document, tmp_path, capsys):
     assert "spectrogram: " in output
 
 
-def test_only_selected_sensors_are_written(document, tmp_path):
+def test_only_selected_sensors_are_written(document, tmp_path, monkeypatch):
+    """The bar has counted all five calls, of two steps of 1 ms each."""
+    counted, close = [], Bar.close
+    monkeypatch.setattr(Bar, "close", lambda bar: counted.append((bar.n, bar.total)) or close(bar))
     Listen(document, ("ear",), seconds=0.01, out=tmp_path / "out").run()
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["ear.wav", "spectrogram.png"]
+    assert counted[0] == (5, 5)
 
 
 @pytest.mark.parametrize(

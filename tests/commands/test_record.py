@@ -5,8 +5,10 @@ import signal
 import threading
 import time
 
+import numpy as np
 import pytest
 from faulty_lines import Faults
+from hand_logs import random_readings, write_log
 from resting_hands import TARE
 
 from tgdsl.runtime.xhand1.driver import XHand1
@@ -37,6 +39,16 @@ def test_record_and_replay(emulator, plugged, here, tmp_path):
     code, _, error = here(tmp_path, "hand", "record", "b.npz", "--seconds", "0")
     assert (code, error) == (2, "tgdsl: --seconds 0: expected more than 0\n")
     assert not (tmp_path / "b.npz").exists()
+
+
+@pytest.mark.parametrize("number", [1, 3])
+def test_replay_ends_with_the_last_reading(here, tmp_path, number):
+    """Also if it is the first one; it is as old as its transfer took."""
+    *_, last = readings = random_readings(0.01 * np.arange(number))
+    write_log(tmp_path / "a.npz", readings)
+    code, output, error = here(tmp_path, "hand", "replay", "a.npz", "--speed", "inf")
+    assert (code, error) == (0, "")
+    assert output.splitlines()[1].startswith(f"reading {last.sequence}   age 8 ms ")
 
 
 def test_replay_of_another_file_is_refused(here, tmp_path):
