@@ -30,8 +30,6 @@ def check(case):
     temperatures, joules = parts(result)
     for (name, part), (_, other) in zip(temperatures, parts(expected)[0], strict=True):
         assert (part.double() - other).abs().max() < RESOLUTION * 80.0, (case, name)
-    after = (exact[0] + expected.cells).sum(dim=(2, 3, 4))
-    assert (result.sums.double() - after).abs().max() < RESOLUTION * 80.0 * expected.cells[0, 0].numel(), (case, "sums")
     for part, other in zip(joules, parts(expected)[1], strict=True):
         scale = max(1e-3, float(other.abs().max()))
         assert (part.double() - other).abs().max() < 10 * RESOLUTION * scale, (case, part, other)

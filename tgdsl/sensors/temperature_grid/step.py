@@ -39,7 +39,6 @@ class Stepped(NamedTuple):
 
     cells: Tensor  # gains of the cells (env, row, x, y, z) [K]
     nodes: Tensor  # gains of the nodes (env, node) [K]
-    sums: Tensor  # sums of the rows' cells after the step (env, row) [K]
     got: tuple[Tensor, ...]  # heat of rows from source, radiation, convection and contact (env, row) each [J]
     nodes_got: tuple[Tensor, ...]  # heat of nodes from radiation, convection and contact (env, node) each [J]
 
@@ -89,9 +88,9 @@ def step(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, consta
     if rows.film_radiated is not None:
         linear = entered * rows.capacity
         radiated, blown = radiated + linear * rows.film_radiated, blown + linear * (1.0 - rows.film_radiated)
-    gained = gained + spread
-    got, nodes_got = (source, radiated, blown, touched), (radiated_nodes, blown_nodes, touched_nodes)
-    return Stepped(gained, nodes_gained, (cells + gained).sum(dim=(-3, -2, -1)), got, nodes_got)
+    return Stepped(
+        gained + spread, nodes_gained, (source, radiated, blown, touched), (radiated_nodes, blown_nodes, touched_nodes)
+    )
 
 
 def _in_modes(
@@ -192,7 +191,7 @@ def _by_kernel(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, 
     assert series is not None  # objects of one temperature have one
     source = constants.get("source")
     less = [part[0].flatten(1) for part in decays(_exponents(rows, dt), is_implicit=False)]
-    gained, nodes_gained, sums, got, nodes_got = heat_step(
+    gained, nodes_gained, got, nodes_got = heat_step(
         [cells, nodes],
         [part.expand(cells.shape[0], -1, -1) for part in (area, series, *patches.pos, *patches.normal)],
         [*(constants[name] for name in ("conductivity", "volumetric_heat", "volume", "box")), *rows.ends],
@@ -208,7 +207,7 @@ def _by_kernel(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, 
     generated = torch.zeros_like(got[:, 0])
     if source is not None:
         generated = generated + dt * constants["power"]
-    return Stepped(gained, nodes_gained, sums, (generated, *got.unbind(1)), nodes_got.unbind(1))
+    return Stepped(gained, nodes_gained, (generated, *got.unbind(1)), nodes_got.unbind(1))
 
 
 def _inputs(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, constants: Constants, dt: Tensor) -> list[Tensor]:
@@ -260,17 +259,17 @@ def advanced(patches: ContactPatch, context: Context, constants: Constants, stat
     is_first = context.is_first[..., None, None, None]
     links, extra = stepped.cells[:, : where.num_bodies], stepped.cells[:, where.num_bodies :]
     x, y, z = cells.shape[2:]
-    start = constants["start"] * constants["is_cell"]
-    cells, cells_low = _sum(cells, cells_low, links[:, :, :x, :y, :z], start, is_first)
+    begun = constants["start"] * constants["is_cell"]
+    cells, cells_low = _sum(cells, cells_low, links[:, :, :x, :y, :z], begun, is_first)
     if where.num_objects:
         gained = gained_by_objects(objects, where, stepped.nodes, extra)
-        above = torch.where(patches.objects.has_start > 0, patches.objects.start - constants["ambient"], 0.0)
-        object_start = above[..., None, None, None] * is_object_cell(objects, where)
-        objects, objects_low = _sum(objects, objects_low, gained, object_start, is_first)
+        start = torch.where(patches.objects.has_start > 0, patches.objects.start - constants["ambient"], 0.0)
+        begun = start[..., None, None, None] * is_object_cell(objects, where)
+        objects, objects_low = _sum(objects, objects_low, gained, begun, is_first)
     calm = context.is_first
     got, nodes_got = (tuple(torch.where(calm, 0.0, part) for part in parts) for parts in (stepped.got, stepped.nodes_got))
     num = where.num_bodies
-    total = torch.where(calm, start.sum(dim=(-3, -2, -1)), stepped.sums[:, :num])
+    total = cells.sum(dim=(-3, -2, -1)) + cells_low.sum(dim=(-3, -2, -1))
     of_links = tuple(part[:, :num] for part in got)
     mean = total / constants["number"]
     of_objects = account(objects + objects_low, patches, rows.capacity, got, nodes_got, mean)
@@ -283,13 +282,13 @@ def _with_objects(cells: Tensor, objects: Tensor, rows: Rows) -> Tensor:
     return torch.cat([padded(cells, size), padded(objects[..., :x, :y, :z], size)], dim=1)
 
 
-def _sum(high: Tensor, low: Tensor, gained: Tensor, start: Tensor, is_first: Tensor) -> tuple[Tensor, Tensor]:
+def _sum(high: Tensor, low: Tensor, gained: Tensor, begun: Tensor, is_first: Tensor) -> tuple[Tensor, Tensor]:
     """Return a compensated sum, or the start (Knuth's two-sum)."""
     more = low + gained
     total = high + more
     added = total - high
     rest = (high - (total - added)) + (more - added)
-    return torch.where(is_first, start, total), torch.where(is_first, 0.0, rest)
+    return torch.where(is_first, begun, total), torch.where(is_first, 0.0, rest)
 
 
 def _as_printed(
@@ -309,5 +308,4 @@ def _as_printed(
     spread, generated, radiated, blown, touched = paper_step(cells, beside, rows, patches, constants, dt)
     got = tuple(part.sum(dim=(-3, -2, -1)) * rows.capacity for part in (generated, radiated, blown, touched))
     idle = torch.zeros_like(nodes)
-    gained = spread + generated + radiated + blown + touched
-    return Stepped(gained, idle, (cells + gained).sum(dim=(-3, -2, -1)), got, (idle, idle, idle))
+    return Stepped(spread + generated + radiated + blown + touched, idle, got, (idle, idle, idle))

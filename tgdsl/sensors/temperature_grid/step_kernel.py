@@ -45,11 +45,8 @@ def heat_step(
     objects: list[Tensor],
     around: list[Tensor],
     convection: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Make a step.
-
-    Returns what cells and the node gain [K], the sum of each row's cells after it [K], and what rows and node get from
-    radiation, convection and contact (env, 3, …) [J].
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return what cells and the node gain [K], and rows and node from radiation, convection and contact (env, 3, …) [J].
 
     Args:
         state: Temperatures of the cells (env, row, x, y, z) and of the node (env, 1), above ambient [K].
@@ -83,24 +80,24 @@ def launch(
     objects: Sequence[Tensor],
     around: Sequence[Tensor],
     convection: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Run the kernel, plain or wrapped, on the arguments of `heat_step`."""
     cells, nodes = (part.contiguous() for part in state)
     num_envs, num_rows, x, y, z = cells.shape
     dt = around[0]
     gained, nodes_gained = cells.new_empty(cells.shape), nodes.new_empty(nodes.shape)
-    sums, got, nodes_got = (cells.new_empty((num_envs, *shape)) for shape in ((num_rows,), (3, num_rows), (3, 1)))
+    got, nodes_got = cells.new_empty((num_envs, 3, num_rows)), cells.new_empty((num_envs, 3, 1))
     pairs, block = block_of(num_rows, x * y * z)
     strides = [part.stride(0) if part.shape[0] > 1 else 0 for part in objects]
     optional = (film, film_radiated, emissivity, source, convection)
     run[(triton.cdiv(num_envs, pairs // num_rows),)](
         cells, nodes, *(part.contiguous() for part in (*patches, *rows, *modes)),
         *(dt if part is None else part.contiguous() for part in optional), *objects, *strides,
-        *around, gained, nodes_gained, sums, got, nodes_got, num_envs,
+        *around, gained, nodes_gained, got, nodes_got, num_envs,
         NX=x, NY=y, NZ=z, ROWS=num_rows, PAIRS=pairs, CELLS=block, HAS_FILM=film is not None, RADIATES=emissivity is not None,
         BLOWS=convection is not None, HAS_SOURCE=source is not None, num_warps=max(1, min(8, pairs * block // OF_WARP)),
     )  # fmt: skip
-    return gained, nodes_gained, sums, got, nodes_got
+    return gained, nodes_gained, got, nodes_got
 
 
 def block_of(num_rows: int, num_cells: int) -> tuple[int, int]:
@@ -117,7 +114,7 @@ def step_kernel(
     film, film_radiated, emissivity, source, convection,
     node_heat, node_volume, node_area, node_conductivity, node_emissivity,
     heat_env, volume_env, area_env, own_k_env, emissivity_env,
-    dt, ambient, gained, nodes_gained, sums, got, nodes_got, num_envs,
+    dt, ambient, gained, nodes_gained, got, nodes_got, num_envs,
     NX: tl.constexpr, NY: tl.constexpr, NZ: tl.constexpr, ROWS: tl.constexpr, PAIRS: tl.constexpr, CELLS: tl.constexpr,
     HAS_FILM: tl.constexpr, RADIATES: tl.constexpr, BLOWS: tl.constexpr, HAS_SOURCE: tl.constexpr,
 ):  # fmt: skip
@@ -225,9 +222,7 @@ def step_kernel(
                 spread, through, heat_of, rate_of, sigma, _mode(vectors, totals, decays, mode, row, place, there, NX, NY, NZ)
             )
     spread -= (tl.sum(spread, axis=0) - through)[None, :] * weight
-    change = (lost + heat_of) + (spread + generated)
-    tl.store(gained + at_cell, change, is_cell)
-    tl.store(sums + pair, tl.sum(start + change, axis=0), is_pair)
+    tl.store(gained + at_cell, (lost + heat_of) + (spread + generated), is_cell)
     # Accounts.
     at_row = env * (3 * ROWS) + row
     tl.store(got + at_row, (radiated + through * linear_share) * capacity, is_pair)
