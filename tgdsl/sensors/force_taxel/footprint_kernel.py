@@ -77,7 +77,7 @@ def shared_forces(
     planes = [plane.contiguous() for plane in (pos, weight, *point, *force, *torque, *normal, *net)]
     wrap_triton(footprint_kernel)[(triton.cdiv(num_envs, ENVS), num_bodies)](
         *planes, radius, levenberg, first, box, shared, sums, num_envs, num_bodies, num_contacts, num_taxels,
-        STEPS=levenberg.shape[0], FEW=FEW_STEPS, ENVS=ENVS, GROUP=GROUP, TILE=TILE, num_warps=1,
+        STEPS=levenberg.shape[0], FEW=FEW_STEPS, ENVS=ENVS, GROUP=GROUP, TILE=TILE, ARE_FEW=num_contacts <= GROUP, num_warps=1,
     )  # fmt: skip
     return shared, sums
 
@@ -88,6 +88,7 @@ def footprint_kernel(
     normal_x, normal_y, normal_z, net_x, net_y, net_z, radius, levenberg, first, box, shared, sums,
     num_envs, num_bodies, num_contacts, num_taxels,
     STEPS: tl.constexpr, FEW: tl.constexpr, ENVS: tl.constexpr, GROUP: tl.constexpr, TILE: tl.constexpr,
+    ARE_FEW: tl.constexpr,
 ):  # fmt: skip
     """Find β of one body in a block of environments, and share out its contacts."""
     body = tl.program_id(1)
@@ -106,17 +107,20 @@ def footprint_kernel(
 
     zero = tl.zeros((ENVS,), tl.float32)
     tilt = (zero, zero, zero)
+    if ARE_FEW:
+        contacts = _contacts(planes, normals, row, is_env, 0, num_contacts, box, inverse, GROUP)
     for step in range(STEPS):
         total = zero + NO_FORCE
         excess = (zero, zero, zero)
         spread = (zero, zero, zero, zero, zero, zero)
         for start in range(0, num_contacts, GROUP):
-            point, force, torque, normal, is_any = _contacts(planes, normals, row, is_env, start, num_contacts, GROUP)
+            if not ARE_FEW:
+                contacts = _contacts(planes, normals, row, is_env, start, num_contacts, box, inverse, GROUP)
+            point, force, torque, normal, strength, way, away, is_beside, is_any = contacts
             if is_any:
-                strength, way = _direction(force)
                 slope = _slope(way, tilt, inverse)
                 captured, norm, top, mean, covariance = _moments(
-                    pos, weights, num_here, box, point, normal, force, slope, inverse, IS_LONG
+                    pos, weights, num_here, point, normal, slope, inverse, away, is_beside, IS_LONG
                 )
                 load = captured * strength
                 total += tl.sum(load, axis=1)
@@ -131,12 +135,13 @@ def footprint_kernel(
 
     carried, unmet = (zero, zero, zero), (zero, zero, zero)
     for start in range(0, tl.maximum(num_contacts, 1), GROUP):
-        point, force, torque, normal, is_any = _contacts(planes, normals, row, is_env, start, num_contacts, GROUP)
+        if not ARE_FEW:
+            contacts = _contacts(planes, normals, row, is_env, start, num_contacts, box, inverse, GROUP)
+        point, force, torque, normal, strength, way, away, is_beside, is_any = contacts
         if is_any | (start == 0):
-            strength, way = _direction(force)
             slope = _slope(way, tilt, inverse)
             captured, norm, top, mean, covariance = _moments(
-                pos, weights, num_here, box, point, normal, force, slope, inverse, IS_LONG
+                pos, weights, num_here, point, normal, slope, inverse, away, is_beside, IS_LONG
             )
             unmet = add3(unmet, _unmet(captured, mean, force, torque))
             each = scale3(tl.where(norm == 0, 0.0, captured / norm), force)
@@ -178,8 +183,8 @@ def footprint_kernel(
 
 
 @triton.jit
-def _contacts(planes, normals, row, is_env, start, num_contacts, GROUP: tl.constexpr):
-    """Return points, forces, torques and normals of a group of contacts, (env, contact), and whether there is any."""
+def _contacts(planes, normals, row, is_env, start, num_contacts, box, inverse, GROUP: tl.constexpr):
+    """Return a group of contacts, (env, contact): points, forces, torques, normals, `_direction`, `_away`, whether any acts."""
     contact = start + tl.arange(0, GROUP)
     at = row[:, None] * num_contacts + contact[None, :]
     is_contact = is_env[:, None] & (contact < num_contacts)[None, :]
@@ -190,7 +195,9 @@ def _contacts(planes, normals, row, is_env, start, num_contacts, GROUP: tl.const
     is_strange = (px != px) | (py != py) | (pz != pz)
     is_any = tl.max(tl.max((acts | is_strange).to(tl.int32), axis=1), axis=0) != 0
     normal = _load(normals[0] + at, is_contact), _load(normals[1] + at, is_contact), _load(normals[2] + at, is_contact)
-    return (px, py, pz), (fx, fy, fz), (tx, ty, tz), normal, is_any
+    strength, way = _direction((fx, fy, fz))
+    away, is_beside = _away(box, (px, py, pz), (fx, fy, fz), inverse)
+    return (px, py, pz), (fx, fy, fz), (tx, ty, tz), normal, strength, way, away, is_beside, is_any
 
 
 @triton.jit
@@ -261,9 +268,8 @@ def _away(box, point, force, inverse):
 
 
 @triton.jit
-def _moments(pos, weights, num_here, box, point, normal, force, slope, inverse, IS_LONG: tl.constexpr):
+def _moments(pos, weights, num_here, point, normal, slope, inverse, away, is_beside, IS_LONG: tl.constexpr):
     """Return γ, the shares' sum and its exponent, and mean [m] and covariance [m²] of the arms: (env, contact)."""
-    away, is_beside = _away(box, point, force, inverse)
     if is_beside:
         result = _moments_about(pos, weights, num_here, point, normal, slope, inverse, away, IS_LONG, True)
     else:
