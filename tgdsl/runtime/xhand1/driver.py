@@ -50,7 +50,7 @@ class Reading:
 
 
 class HandReader(threading.Thread):
-    """Exchanges without end, and notifies `changed` of every reading and failure."""
+    """Exchanges until it is stopped, and notifies `changed` of every reading and of its end."""
 
     def __init__(self, client: SerialClient, connect: Callable[[SerialCounters], SerialClient], motion: Motion):
         super().__init__(name="xhand1", daemon=True)
@@ -118,7 +118,6 @@ class HandReader(threading.Thread):
         with self.changed:
             self.motion.fail(error)
             self.failure = error, time.monotonic()
-            self.changed.notify_all()
         if self._client is None:
             self._stopping.wait(_RECONNECT_S)
 
