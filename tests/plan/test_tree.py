@@ -59,6 +59,10 @@ def test_a_mapped_tree_changes_each_array_once_and_keeps_what_has_none():
     assert tree.mapped(root, lambda array: array) is root
 
 
+def test_a_mapping_of_which_one_part_changes_is_another():
+    assert tree.mapped({"name": "k", "array": np.zeros(2)}, lambda array: "leaf") == {"name": "k", "array": "leaf"}
+
+
 @pytest.mark.parametrize(
     ("place", "value"),
     [(("shared",), {"array": "nowhere"}), (("parts", 2, "size"), [1]), (("parts", 0), {"name": "x"}), (("more",), 1)],

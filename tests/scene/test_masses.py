@@ -98,6 +98,13 @@ def test_new_geoms_of_a_scenes_body_give_its_mass(tmp_path, options):
     np.testing.assert_allclose(masses, [MASSES[0], sum(MASSES)], rtol=EXACT)
 
 
+def test_new_geoms_of_a_body_with_an_inertia_element_leave_it(tmp_path):
+    scenes, _ = scene_of(tmp_path, "inertiafromgeom='false'", held={"body": "held", "variants": [BALL, BOX]})
+    for variant in (0, 1):
+        body = scenes.model({"held": Choice(variant)}).body("held")
+        np.testing.assert_allclose([*body.mass, *np.sort(body.inertia)], [0.3, 0.02, 0.025, 0.03], rtol=EXACT)
+
+
 def test_a_mesh_has_the_mass_of_its_density(tmp_path):
     trimesh.creation.box((0.02, 0.04, 0.06)).export(tmp_path / "brick.stl")
     brick = {"mesh": str(tmp_path / "brick.stl"), "density": 300, "scale": 1.0}
