@@ -97,6 +97,14 @@ def test_a_reset_raises_when_the_simulation_has_ended(touch, monkeypatch):
             env.reset()
 
 
+def test_a_given_timing_decides_how_long_a_reply_may_take(touch, monkeypatch):
+    with tgdsl.connect(touch, "emulator", calibration=NEWTON, timing=SerialTiming(reply_timeout_s=0.05)) as env:
+        assert isinstance(env.source, EmulatedSource)
+        monkeypatch.setattr(env.source.emulator.line, "answer", lambda frame, arrived_at: None)
+        with pytest.raises(HandError, match="no reply to .* within 50 ms"):
+            steps(env, 10)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("lockstep", [True, False])
 def test_step_reset_and_close_raise_when_the_emulator_has_ended(touch, monkeypatch, lockstep):

@@ -125,6 +125,14 @@ def test_a_gripper_presses_in_proportion_to_the_weight_and_its_arm_stays(closed_
     assert closing.resting == (0, 1) and not sim.ctrl[0, :2].any()
 
 
+def test_a_hinge_presses_with_the_weight_between_its_tips_middle_and_far_end(tmp_path):
+    ball = {"type": "sphere", "size": [0.012], "density": 500}
+    closing = closing_of(module(tmp_path, "jaws.xml", world(hinged_jaws()), {"ball": {"geom": ball}}))
+    force = GRIP * 9.81 * 500 * 4 / 3 * np.pi * 0.012**3
+    for servo in closing.servos:
+        assert np.hypot(0.01, 0.04) < servo.limit / force < np.linalg.norm([0.015, 0.01, 0.07])
+
+
 @pytest.mark.slow
 def test_forces_are_bounded_on_a_heavy_object(tmp_path):
     text = scene("<body name='ball' pos='1 0 0'><freejoint/><geom size='.012' mass='5'/></body>")

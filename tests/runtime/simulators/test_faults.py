@@ -203,6 +203,18 @@ def test_faults_wait_for_a_reset_by_default(tmp_path, simulator):
 
 
 @BOTH
+def test_a_saved_state_ends_faults(tmp_path, simulator):
+    sim = simulator(module(tmp_path), 3, keyframe="home")
+    saved = sim.state_dict()
+    sim.qvel[1, 0] = torch.nan
+    with pytest.raises(SimulationError, match="environments 1 diverged"):
+        sim.step()
+    sim.load_state_dict(saved)
+    assert not sim.faults.any()
+    sim.step()
+
+
+@BOTH
 def test_clipped_controls_are_warned_of_once(tmp_path, simulator):
     """A control in degrees; motors without a range accept any value."""
     scene = SCENE.replace("</actuator>", '<position name="turn" joint="two" ctrlrange="-1.5 1.5"/></actuator>')

@@ -5,6 +5,7 @@ of a few micrometres at positions of a few centimetres: at rest they agree equal
 """
 
 import copy
+import gc
 import sys
 from pathlib import Path
 
@@ -30,7 +31,7 @@ from tgdsl.errors import SimulationError
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.warp import WarpSimulation
 from tgdsl.runtime.warp.simulation import constraint_rows
-from tgdsl.runtime.warp.stream import GraphedCall, WarpStream
+from tgdsl.runtime.warp.stream import GraphedCall, WarpStream, _no_collection
 
 
 class PretendedGpu(WarpStream):
@@ -142,6 +143,13 @@ def test_a_call_is_captured_the_third_time_and_then_replayed():
     replay.forget()
     assert [replay() for _ in range(3)] == [4, 5, 6]
     assert (stream.captures, stream.replays) == (2, 4)
+
+
+def test_no_garbage_is_collected_while_a_call_is_captured():
+    """Else an array of Warp's that is freed by chance would break the capture."""
+    with _no_collection():
+        assert not gc.isenabled()
+    assert gc.isenabled()
 
 
 @pytest.mark.slow
