@@ -190,6 +190,15 @@ def test_a_changed_constant_stays_changed(touch):
     assert touch.double().constants["sensors/touch/normal_stiffness"].item() == 123.0
 
 
+def test_a_constant_overwritten_under_inference_mode_has_gradients_after_a_cast(touch):
+    name = "sensors/touch/normal_stiffness"
+    with torch.inference_mode():
+        touch.constants.overwrite(name, np.full(touch.constants[name].shape, 123.0))
+    stiffness = touch.double().constants[name].requires_grad_()
+    (2 * stiffness).sum().backward()
+    assert stiffness.item() == 123.0 and stiffness.grad.item() == 2.0
+
+
 def test_parameters_have_gradients(document):
     touch = tgdsl.compile(document, dtype=torch.float64)
     stiffness = touch.constants["sensors/touch/normal_stiffness"].requires_grad_()
