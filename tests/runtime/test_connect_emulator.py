@@ -101,7 +101,7 @@ def test_a_given_timing_decides_how_long_a_reply_may_take(touch, monkeypatch):
     with tgdsl.connect(touch, "emulator", calibration=NEWTON, timing=SerialTiming(reply_timeout_s=0.05)) as env:
         assert isinstance(env.source, EmulatedSource)
         monkeypatch.setattr(env.source.emulator.line, "answer", lambda frame, arrived_at: None)
-        with pytest.raises(HandError, match="no reply to .* within 50 ms"):
+        with pytest.raises(HandError, match=r"no reply to .* within 50 ms"):
             steps(env, 10)
 
 
