@@ -237,6 +237,27 @@ def step_kernel(
 
 
 @triton.jit
+def _sums2(a, b):
+    """Return sums over cells (P): one reduction costs the barriers of one sum."""
+    return tl.reduce((a, b), 0, _add2)
+
+
+@triton.jit
+def _sums3(a, b, c):
+    return tl.reduce((a, b, c), 0, _add3)
+
+
+@triton.jit
+def _add2(a, b, other_a, other_b):
+    return a + other_a, b + other_b
+
+
+@triton.jit
+def _add3(a, b, c, other_a, other_b, other_c):
+    return a + other_a, b + other_b, c + other_c
+
+
+@triton.jit
 def _at(plane, at, is_there):
     return tl.load(plane + at, is_there, 0.0)
 
@@ -276,17 +297,20 @@ def _mode(vectors, totals, decays, mode, row, place, there, NX: tl.constexpr, NY
 def _without_contact(average, end, entered, by_cell, by_side, apart, mean, made, shares, mode, HAS_SOURCE: tl.constexpr):
     """Add a mode to what cells gain without contact, in the mean and at the end, and to what all show: see `response`."""
     wave, total, a, b, c, d = mode
-    part = tl.sum(apart * wave, axis=0) + mean * total
+    if HAS_SOURCE:
+        part, mean_wave, warmed = _sums3(apart * wave, shares * wave, made * wave)
+    else:
+        part, mean_wave = _sums2(apart * wave, shares * wave)
+    part += mean * total
     of_mean, of_end = part * b, part * a
     if HAS_SOURCE:
-        warmed = tl.sum(made * wave, axis=0)
         of_mean += warmed * c
         of_end += warmed * b
     average += of_mean[None, :] * wave
     end += of_end[None, :] * wave
     entered += of_end * total
     a, b, c, d = a + 1.0, b + 1.0, c + 0.5, d + 1.0 / 6.0
-    squared, mean_wave = wave * wave, tl.sum(shares * wave, axis=0)
+    squared = wave * wave
     mean_wave *= mean_wave
     by_cell = (
         by_cell[0] + squared * a[None, :], by_cell[1] + squared * b[None, :],
@@ -301,7 +325,8 @@ def _with_contact(spread, through, heat, rate, sigma, mode):
     """Add a mode to what cells gain of contact beyond the heat that they get (C, P), and through faces (P)."""
     wave, total, a, b, c, _ = mode
     _, _, of_heat, of_rate = _response((a, b, c, c), sigma)
-    along = tl.sum(heat * wave, axis=0) * of_heat + tl.sum(rate * wave, axis=0) * of_rate
+    heat, rate = _sums2(heat * wave, rate * wave)
+    along = heat * of_heat + rate * of_rate
     return spread + along[None, :] * wave, through + along * total
 
 
@@ -475,13 +500,14 @@ def _touched(
     a, b, c, d = _response(by_cell, sigma[None, :])
     ra, rb, rc, rd = _response(by_side, sigma)
     squared = shares * shares
-    ra, rb = (ra - tl.sum(squared * a, axis=0)) * over, (rb - tl.sum(squared * b, axis=0)) * over
-    rc, rd = (rc - tl.sum(squared * c, axis=0)) * over, (rd - tl.sum(squared * d, axis=0)) * over
+    own_a, own_b = _sums2(squared * a, squared * b)
+    own_c, own_d = _sums2(squared * c, squared * d)
+    ra, rb, rc, rd = (ra - own_a) * over, (rb - own_b) * over, (rc - own_c) * over, (rd - own_d) * over
     # Cells: H and J are f S (temperatures of the node − free).
     per = flow * over[None, :]
     sa, sb, sc, sd = _inverted(1.0 + per * a, per * b, per * c, 1.0 + per * d)
-    ya, yb, yc, yd = tl.sum(flow * sa, axis=0), tl.sum(flow * sb, axis=0), tl.sum(flow * sc, axis=0), tl.sum(flow * sd, axis=0)
-    one, other = tl.sum(flow * (sa * average + sb * end), axis=0), tl.sum(flow * (sc * average + sd * end), axis=0)
+    ya, yb, one = _sums3(flow * sa, flow * sb, flow * (sa * average + sb * end))
+    yc, yd, other = _sums3(flow * sc, flow * sd, flow * (sc * average + sd * end))
     # Sides: H and J are F (Y (temperatures of the node) − …).
     fa, fb, fc, fd = _inverted(1.0 + ya * ra + yb * rc, ya * rb + yb * rd, yc * ra + yd * rc, 1.0 + yc * rb + yd * rd)
     za, zb, zc, zd = fa * ya + fb * yc, fa * yb + fb * yd, fc * ya + fd * yc, fc * yb + fd * yd
