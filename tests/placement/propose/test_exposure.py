@@ -1,12 +1,14 @@
 """At every resolution, no taxel of a proposed layout is buried, covered or not collided without a note."""
 
+import numpy as np
 import pytest
 from covered_hands import hand, shell
 from odd_hands import HANDS
 
 from tgdsl.compiler.pipeline import placed
 from tgdsl.formats.robot import load_model
-from tgdsl.placement.propose.propose import FACTORS, propose
+from tgdsl.placement.propose.propose import FACTORS, Draft, propose
+from tgdsl.placement.propose.text import write_layout
 from tgdsl.schema.load import load_layout
 
 SIDES = pytest.mark.parametrize("side", [1, -1], ids=["right", "left"])
@@ -52,6 +54,18 @@ def test_every_taxel_can_feel(tmp_path, here, side):
     bare = '"the tip": the simulator does not collide it, so contacts never reach it'
     assert f"left out: {bare}" in lines and f"# Left out: {bare}\n" in text
     assert "not collided" not in output
+
+
+def test_a_draft_samples_the_surfaces_of_its_file(tmp_path):
+    """The collision geometry of the palm and the thumb, the meshes of the others."""
+    (tmp_path / "hand.xml").write_text(hand(1))
+    draft = Draft(load_model(tmp_path / "hand.xml"), 4e4)
+    write_layout(draft, tmp_path / "layout.yaml")
+    robot = {"model": str(tmp_path / "hand.xml"), "layout": str(tmp_path / "layout.yaml")}
+    layout = placed({"tgdsl": 1, "robot": robot}).layouts["med"]
+    for i, link in enumerate(layout.links):
+        proposal = next(each for each in draft.proposal.links if each.name == link.name)
+        assert np.array_equal(draft.samples(proposal, "med").pos, layout.pos[layout.link_id == i])
 
 
 @SIDES

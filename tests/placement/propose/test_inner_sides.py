@@ -163,7 +163,8 @@ def test_groups_and_sides_of_the_xhand1_match_its_layout():
     assert {facing[name] for name in ("link", "index_rota_link2", "mid_link1", "mid_link2", "pinky_link2")} == {(1, 0, 0)}
 
 
-def test_a_palm_faces_the_fingers_that_stand_on_it(tmp_path):
+@pytest.mark.parametrize("pos", ["0 0 .1", "2 -1 .5"])
+def test_a_palm_faces_the_fingers_that_stand_on_it(tmp_path, pos):
     """Two fingers and a thumb opposite of them: the two curl alike, and all three can close into the palm."""
     finger = """<body name="{0}" pos="{1} 0.015" euler="0 0 {2}"><joint axis="0 -1 0" range="-30 90"/>
         <geom type="capsule" fromto="0 0 .004 0 0 .04" size=".008"/>
@@ -171,7 +172,7 @@ def test_a_palm_faces_the_fingers_that_stand_on_it(tmp_path):
           <geom type="capsule" fromto="0 0 0 0 0 .03" size=".008"/></body></body>"""
     places = (("a", ".035 .02", 0), ("b", ".035 -.02", 0), ("thumb", "-.035 0", 180))
     fingers = "".join(finger.format(*place) for place in places)
-    palm = f'<body name="palm" pos="0 0 .1"><geom type="box" size=".04 .04 .01"/>{fingers}</body>'
+    palm = f'<body name="palm" pos="{pos}"><geom type="box" size=".04 .04 .01"/>{fingers}</body>'
     facing = {link.name: link.facing for link in propose(loaded(tmp_path, world(palm)), DENSITY).links}
     assert facing == {"palm": (0, 0, 1)} | {name: (-1, 0, 0) for name in facing if name != "palm"} and len(facing) == 7
 
