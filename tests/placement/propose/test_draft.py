@@ -57,7 +57,8 @@ def test_one_density_for_all_links_gives_the_file_of_the_command(tmp_path, here)
     draft.change(TIPS, density=9e4)
     draft.change({link.name for link in draft.proposal.links}, density=7e4)
     assert here(tmp_path, "layout", "new", "hand.xml", "--density", "7/cm2")[0] == 0
-    assert layout_text(draft.proposal, "hand.xml") == (tmp_path / "layout.yaml").read_text()
+    text = (tmp_path / "layout.yaml").read_text()
+    assert layout_text(draft.proposal, "hand.xml") == text and "# Density: 7 taxels per cm²" in text
 
 
 def test_sides_and_regions_can_change_and_return(tmp_path):
