@@ -142,6 +142,14 @@ def test_incomplete_tendon_paths_are_refused(tmp_path):
     assert error_of(stage) == "/tendon: mjc:path:indices is [0, 2]; mjc:path has 2 targets"
 
 
+@pytest.mark.parametrize(("name", "indices"), [("path:segments", (0, 1, 0)), ("sideSites:indices", (-1, 0, -1))])
+def test_a_tendon_that_names_more_divisors_or_side_sites_than_it_has_is_refused(tmp_path, name, indices):
+    stage = schema_stage(tmp_path)
+    author(stage.GetPrimAtPath("/cable"), f"mjc:{name}", indices)
+    message = "/cable: mjc:path:divisors or mjc:sideSites has fewer entries than the path names"
+    assert error_of(stage) == message
+
+
 def test_a_spatial_tendon_over_a_pulley_and_around_a_ball(tmp_path):
     """Expected wraps: site, ball with its side site, site, pulley, site, site."""
     stage = schema_stage(tmp_path)

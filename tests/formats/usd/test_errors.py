@@ -131,7 +131,7 @@ def test_invalid_joints_filters_and_gravity_are_refused(tmp_path):
         (WEDGE, [], "the mesh has no faceVertexCounts"),
         (WEDGE, [(0, 1, 4)], "faceVertexIndices holds 4; the mesh has 4 points"),
         (WEDGE, [(0, 1, -1)], "faceVertexIndices holds -1; the mesh has 4 points"),
-        (WEDGE, [(0, 1)], "the mesh has a face with 2 corners; expected 3 or more"),
+        (WEDGE, [(0, 1), (0, 1, 2)], "the mesh has a face with 2 corners; expected 3 or more"),
         ([*WEDGE[:3], (0, 0, math.inf)], WEDGE_FACES, "the mesh has points that are not finite"),
         (QUAD, [(0, 1, 2, 3)], "the mesh is flat: it has no hull to collide; use a plane or a thin box"),
     ],

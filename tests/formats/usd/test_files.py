@@ -56,6 +56,14 @@ def test_written_files_give_the_model_of_the_text(tmp_path):
         np.testing.assert_array_equal(getattr(inline, name), getattr(written, name), err_msg=name)
 
 
+def test_written_files_have_a_line_for_each_element(tmp_path):
+    stage = new_stage(tmp_path)
+    add_body(stage, "/b")
+    write_mjcf(usd_to_mjcf(path_of(stage)), tmp_path / "hand.xml")
+    lines = (tmp_path / "hand.xml").read_text().splitlines()
+    assert len(lines) > 2 and all(line.count("<") == 1 for line in lines)
+
+
 def test_no_partial_files_are_left(tmp_path, monkeypatch):
     stage = new_stage(tmp_path)
     add_body(stage, "/b")
