@@ -185,6 +185,11 @@ def test_float64_constants_equal_the_plans_exactly(document):
     assert touch.constants["pairs/link"].dtype == torch.int64
 
 
+def test_the_tree_of_constants_has_the_buffers_also_after_a_cast(touch):
+    constants = touch.double().constants
+    assert constants.tree["sensors"]["touch"].normal_stiffness is constants["sensors/touch/normal_stiffness"]
+
+
 def test_a_changed_constant_stays_changed(touch):
     touch.constants["sensors/touch/normal_stiffness"].fill_(123.0)
     assert touch.double().constants["sensors/touch/normal_stiffness"].item() == 123.0
