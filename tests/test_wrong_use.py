@@ -252,12 +252,14 @@ def test_masks_of_environments():
             env_mask([3], 3, cpu, error)
 
 
-def test_indices_on_a_device_are_not_looked_at():
+def test_indices_on_a_device_are_looked_at_only_by_who_waits():
     """On the device `meta` tensors have no numbers: whoever looked at one would fail."""
     meta = torch.device("meta")
     for dtype in (torch.int32, torch.int64):
         mask = env_mask(torch.tensor([5], dtype=dtype, device=meta), 3, meta, waits=False)
         assert (mask.shape, mask.dtype, mask.device) == ((3,), torch.bool, meta)
+    with pytest.raises(NotImplementedError):  # a simulation does look, and waits for it
+        env_mask(torch.tensor([5], device=meta), 3, meta)
     given = torch.ones(3, dtype=torch.bool, device=meta)
     assert env_mask(given, 3, meta) is given
     assert env_mask(None, 3, meta).device == meta

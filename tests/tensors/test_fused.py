@@ -45,6 +45,15 @@ def test_shapes_may_differ_between_calls():
         assert torch.equal(double(torch.arange(num)), 2 * torch.arange(num))
 
 
+def test_shapes_that_may_differ_are_compiled_once(monkeypatch):
+    graphs = []
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend=lambda graph, inputs: graphs.append(graph) or graph))
+    double = FusedCall(Doubled().of, True, has_fixed_shapes=False)
+    for num in (3, 7, 2, 9):
+        assert torch.equal(double(torch.arange(num)), 2 * torch.arange(num))
+    assert len(graphs) == 1
+
+
 class Doubled:
     def of(self, value):
         return 2 * value
