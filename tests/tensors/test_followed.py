@@ -36,3 +36,10 @@ def test_tracing_without_gradients_records_every_operation(is_deep):
         torch.testing.assert_close(torch.func.vmap(rotated_power)(torch.stack([other, quat]))[0], plain)
         torch.testing.assert_close(torch.jit.trace(rotated_power, (quat,), check_trace=False)(other), plain)
         torch.testing.assert_close(make_fx(rotated_power)(quat)(other), plain)
+
+
+def test_a_forward_derivative_of_no_depth_is_zero():
+    """By a shortcut it would be missing."""
+    with torch.no_grad(), forward_ad.dual_level():
+        depth = forward_ad.make_dual(torch.tensor([-1.0, 0.0]), torch.ones(2))
+        assert forward_ad.unpack_dual(planes.power(depth, 1.5)).tangent.tolist() == [0.0, 0.0]
