@@ -52,6 +52,15 @@ def test_controls_change_the_chosen_links_and_the_button_writes_the_commands_fil
     assert (tmp_path / "again.yaml").read_text() == text
 
 
+def test_discs_are_polygons_of_16_corners(tmp_path):
+    with opened(tmp_path) as page:
+        handle = page._discs["palm"][1]
+        a, b, c = (handle.vertices[handle.faces[:, i]] for i in range(3))
+        normals = np.cross(b - a, c - a)
+    np.testing.assert_allclose(normals[:, :2], 0.0, atol=1e-7)
+    np.testing.assert_allclose(normals[:, 2], np.sin(2 * np.pi / 16), atol=1e-6)  # twice the area of each of 16 triangles
+
+
 def test_side_box_and_resolution_move_the_taxels(tmp_path):
     with opened(tmp_path) as page:
         page._choose("left_tip")
