@@ -5,6 +5,8 @@
 
 `keep` copies the results of `tgdsl distill` to docs/measured/ablations/NAME; `page` writes tables and plots from all results
 there. Runs that differ in their number of iterations alone have one name. Names SERIES__NETWORKS share a section and a plot.
+The plot of names SERIES__WAY_NUMBER, such as `taxels__gates_20`, has scores over numbers of taxels, chosen in each way; scores
+of the series' other names are lines.
 
 A student has **converged** if twice as many iterations change its score by less than 5 % of that score. A type is **worse**
 than another in the same place if both have converged and several seeds, and the 95 % intervals of their scores do not overlap.
@@ -24,6 +26,7 @@ import io
 import json
 import math
 import sys
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -318,6 +321,28 @@ def plot(members: Sequence[Results]) -> Figure:
     return figure
 
 
+def plot_by_number(members: Sequence[Results]) -> Figure:
+    """Return scores by number of taxels, and their 95 % intervals."""
+    figure = Figure(figsize=(6.4, 4.2), dpi=100, layout="constrained")
+    axes, ways = figure.subplots(), defaultdict(list)
+    for run in members:
+        way, _, number = run.networks.rpartition("_")
+        for _, row in run.final.values():
+            if number.isdigit():
+                ways[way].append((int(number), row.score, row.score - row.low, row.high - row.score))
+            else:
+                axes.axhline(row.score, linestyle=":", linewidth=1.0, color=COLOURS.get(row.type, "grey"))
+                axes.annotate(row.placement or row.type, (1.0, row.score), xycoords=("axes fraction", "data"), fontsize=8)
+    for way, points in ways.items():
+        number, score, below, above = np.array(sorted(points)).T
+        axes.errorbar(number, score, (below, above), marker="o", capsize=3, label=way)
+    axes.set_xscale("log")
+    axes.set_xlabel("taxels")
+    axes.set_ylabel(f"score [{members[0].run['unit']}]")
+    axes.legend(frameon=False)
+    return figure
+
+
 def _keys(row: Row) -> list[StudentKey]:
     touch = None if row.type == NONE else PolicyTouch(row.type, row.placement, row.noise)
     return [StudentKey(touch, seed) for seed in range(row.seeds)]
@@ -329,7 +354,8 @@ def write_pages(folder: Path = RESULTS, pages: tuple[Path, Path] = PAGES) -> lis
     contents = {page: _between(page, text) for page, text in zip(pages, (summary(runs), sections(runs)), strict=True)}
     for series, members in _by_series(runs).items():
         png = io.BytesIO()
-        FigureCanvasAgg(plot(members)).print_png(png, metadata={"Software": None})
+        is_by_number = any(run.networks.rpartition("_")[2].isdigit() for run in members)
+        FigureCanvasAgg((plot_by_number if is_by_number else plot)(members)).print_png(png, metadata={"Software": None})
         contents[with_folder(pages[1].parents[1] / "images" / f"ablation_{series}.png")] = png.getvalue()
     atomic_write_all(contents)
     return list(contents)

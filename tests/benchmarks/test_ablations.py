@@ -82,6 +82,17 @@ def test_a_thinned_curve_has_means_without_episodes_that_began_before():
     assert {line["Score/b"] for line in rows} == {""}
 
 
+def test_scores_are_plotted_by_number_of_taxels():
+    scores = {"gates_20": 8.0, "gates_5": 4.0, "even_20": 6.0, "places": 9.0}
+    members = [
+        ablations.Results(f"taxels__{name}", {"unit": "m"}, {300: [row("force", value)]}, {}) for name, value in scores.items()
+    ]
+    axes = ablations.plot_by_number(members).axes[0]
+    points = {bars.get_label(): bars.lines[0].get_xydata().tolist() for bars in axes.containers}
+    assert points == {"gates": [[5.0, 4.0], [20.0, 8.0]], "even": [[20.0, 6.0]]}
+    assert [line.get_ydata()[0] for line in axes.lines if line.get_linestyle() == ":"] == [9.0]
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 def test_runs_of_tgdsl_distill_are_kept_and_compared(tmp_path, here, no_onnx):
