@@ -107,7 +107,7 @@ def footprint_kernel(
 
     zero = tl.zeros((ENVS,), tl.float32)
     tilt = (zero, zero, zero)
-    if ARE_FEW:
+    if ARE_FEW:  # one group: not read again in each step
         contacts = _contacts(planes, normals, row, is_env, 0, num_contacts, box, inverse, GROUP)
     for step in range(STEPS):
         total = zero + NO_FORCE
