@@ -12,6 +12,7 @@ import pytest
 from unscripted_hands import URDF
 
 import tgdsl
+from tgdsl.commands.arguments import parsed_overrides
 from tgdsl.schema.document import json_schema
 
 REPOSITORY = Path(__file__).parents[2]
@@ -291,3 +292,9 @@ def test_the_suffix_sets_the_format_of_an_export(base, here, monkeypatch, argume
     monkeypatch.setattr(tgdsl.TactileModule, "export", export)
     with pytest.raises(Exported, match=f"^{format_}$"):
         here(base, "export", "pad.yaml", *arguments)
+
+
+def test_a_repeated_override_has_its_last_place():
+    """Else a mapping that is given in between would replace it."""
+    pairs = ("skin.shear=1", "skin={shear: 2}", "skin.shear=3")
+    assert list(parsed_overrides(pairs).items()) == [("skin", "{shear: 2}"), ("skin.shear", "3")]
