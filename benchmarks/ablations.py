@@ -5,8 +5,8 @@
 
 `keep` copies the results of `tgdsl distill` to docs/measured/ablations/NAME; `page` writes tables and plots from all results
 there. Runs that differ in their number of iterations alone have one name. Names SERIES__NETWORKS share a section and a plot.
-The plot of names SERIES__WAY_NUMBER, such as `taxels__gates_20`, has scores over numbers of taxels, chosen in each way; scores
-of the series' other names are lines.
+A series with names SERIES__WAY_NUMBER, such as `taxels__gates_20`, is plotted over the number of taxels, with a curve for each
+way to choose them and a line for each other score.
 
 A student has **converged** if twice as many iterations change its score by less than 5 % of that score. A type is **worse**
 than another in the same place if both have converged and several seeds, and the 95 % intervals of their scores do not overlap.

@@ -77,7 +77,8 @@ def shared_forces(
     planes = [plane.contiguous() for plane in (pos, weight, *point, *force, *torque, *normal, *net)]
     wrap_triton(footprint_kernel)[(triton.cdiv(num_envs, ENVS), num_bodies)](
         *planes, radius, levenberg, first, box, shared, sums, num_envs, num_bodies, num_contacts, num_taxels,
-        STEPS=levenberg.shape[0], FEW=FEW_STEPS, ENVS=ENVS, GROUP=GROUP, TILE=TILE, ARE_FEW=num_contacts <= GROUP, num_warps=1,
+        STEPS=levenberg.shape[0], FEW=FEW_STEPS, ENVS=ENVS, GROUP=GROUP, TILE=TILE,
+        ONE_GROUP=num_contacts <= GROUP, num_warps=1,
     )  # fmt: skip
     return shared, sums
 
@@ -88,7 +89,7 @@ def footprint_kernel(
     normal_x, normal_y, normal_z, net_x, net_y, net_z, radius, levenberg, first, box, shared, sums,
     num_envs, num_bodies, num_contacts, num_taxels,
     STEPS: tl.constexpr, FEW: tl.constexpr, ENVS: tl.constexpr, GROUP: tl.constexpr, TILE: tl.constexpr,
-    ARE_FEW: tl.constexpr,
+    ONE_GROUP: tl.constexpr,
 ):  # fmt: skip
     """Find β of one body in a block of environments, and share out its contacts."""
     body = tl.program_id(1)
@@ -107,14 +108,14 @@ def footprint_kernel(
 
     zero = tl.zeros((ENVS,), tl.float32)
     tilt = (zero, zero, zero)
-    if ARE_FEW:  # one group: not read again in each step
+    if ONE_GROUP:  # not read again in each step
         contacts = _contacts(planes, normals, row, is_env, 0, num_contacts, box, inverse, GROUP)
     for step in range(STEPS):
         total = zero + NO_FORCE
         excess = (zero, zero, zero)
         spread = (zero, zero, zero, zero, zero, zero)
         for start in range(0, num_contacts, GROUP):
-            if not ARE_FEW:
+            if not ONE_GROUP:
                 contacts = _contacts(planes, normals, row, is_env, start, num_contacts, box, inverse, GROUP)
             point, force, torque, normal, strength, way, away, is_beside, is_any = contacts
             if is_any:
@@ -135,7 +136,7 @@ def footprint_kernel(
 
     carried, unmet = (zero, zero, zero), (zero, zero, zero)
     for start in range(0, tl.maximum(num_contacts, 1), GROUP):
-        if not ARE_FEW:
+        if not ONE_GROUP:
             contacts = _contacts(planes, normals, row, is_env, start, num_contacts, box, inverse, GROUP)
         point, force, torque, normal, strength, way, away, is_beside, is_any = contacts
         if is_any | (start == 0):

@@ -325,8 +325,8 @@ def _with_contact(spread, through, heat, rate, sigma, mode):
     """Add a mode to what cells gain of contact beyond the heat that they get (C, P), and through faces (P)."""
     wave, total, a, b, c, _ = mode
     _, _, of_heat, of_rate = _response((a, b, c, c), sigma)
-    heat, rate = _sums2(heat * wave, rate * wave)
-    along = heat * of_heat + rate * of_rate
+    heat_part, rate_part = _sums2(heat * wave, rate * wave)
+    along = heat_part * of_heat + rate_part * of_rate
     return spread + along[None, :] * wave, through + along * total
 
 
