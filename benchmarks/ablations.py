@@ -337,6 +337,9 @@ def plot_by_number(members: Sequence[Results]) -> Figure:
         number, score, below, above = np.array(sorted(points)).T
         axes.errorbar(number, score, (below, above), marker="o", capsize=3, label=way)
     axes.set_xscale("log")
+    numbers = sorted({int(number) for points in ways.values() for number, *_ in points})
+    axes.set_xticks(numbers, [f"{number}" for number in numbers])
+    axes.set_xticks([], minor=True)
     axes.set_xlabel("taxels")
     axes.set_ylabel(f"score [{members[0].run['unit']}]")
     axes.legend(frameon=False)
