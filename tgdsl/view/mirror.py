@@ -25,7 +25,7 @@ from contextlib import suppress
 from dataclasses import replace
 from queue import Empty, SimpleQueue
 from types import SimpleNamespace
-from typing import Any, BinaryIO, NamedTuple, cast
+from typing import IO, Any, BinaryIO, NamedTuple, cast
 
 import mujoco
 import numpy as np
@@ -94,7 +94,7 @@ class LoopPage:
         self._process = subprocess.Popen([sys.executable, "-c", _CHILD], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=env)
         self._shapes = shapes_of(stage.model)  # of the model that the page has
         frame, tables = self._frame(0), _tables(stage.touch)
-        self._send(_Opening(tables, stage.model, stage.num_envs, frame, host, port, priority))
+        _send(_Opening(tables, stage.model, stage.num_envs, frame, host, port, priority), self._process.stdin)
         try:
             answer = pickle.load(cast(BinaryIO, self._process.stdout))
         except EOFError:
@@ -132,17 +132,12 @@ class LoopPage:
         self._shapes = self._shapes if frame.model is None else shapes_of(frame.model)
         return frame
 
-    def _send(self, value: Any) -> None:
-        sink = cast(BinaryIO, self._process.stdin)
-        pickle.dump(value, sink)
-        sink.flush()
-
     def _answer(self) -> None:
         """Answer each request of the page with the next frame."""
         try:
             while True:
                 self._wanted = pickle.load(cast(BinaryIO, self._process.stdout))
-                self._send(self._frames.get())
+                _send(self._frames.get(), self._process.stdin)
         except (EOFError, OSError, ValueError, pickle.UnpicklingError):  # it has ended
             if not self._is_closed:
                 print("tgdsl view: the page's process has ended; the loop goes on without it", file=sys.stderr)
@@ -173,6 +168,12 @@ def frame_of(stage: Stage, env: int, shapes: bytes) -> Frame:
     readings = {o.name: stage.readings[o.name][env].detach().cpu().numpy().copy() for o in stage.outputs if stage.readings}
     notes, other = dict(stage.notes(env)), model if is_other else None
     return Frame(env, stage.time, pos.copy(), quat.copy(), readings, notes, stage.state(env), other)
+
+
+def _send(value: Any, sink: IO[bytes] | None) -> None:
+    assert sink is not None
+    pickle.dump(value, sink)
+    sink.flush()
 
 
 def _tables(touch: TactileModule) -> SimpleNamespace:
@@ -208,8 +209,7 @@ class MirrorStage(Stage):
             self._is_waiting = False
         if not self._is_waiting:
             self._is_waiting = True
-            pickle.dump(self._env, self._sink)
-            self._sink.flush()
+            _send(self._env, self._sink)
 
     def restart(self) -> None:
         """Do nothing: the loop controls itself."""
@@ -257,11 +257,9 @@ def serve() -> None:
         with warnings.catch_warnings(action="ignore"):  # the loop's process warns of the network
             page = Page(stage, opening.host, opening.port)
     except TgdslError as error:
-        pickle.dump(TgdslError(str(error)), sink)
-        sink.flush()
+        _send(TgdslError(str(error)), sink)
         return
-    pickle.dump(page.url, sink)
-    sink.flush()
+    _send(page.url, sink)
     if hasattr(os, "nice"):
         os.nice(opening.priority)
     while not stage.is_over:
