@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections import deque
 
 import numpy as np
@@ -58,8 +57,8 @@ class HandView:
         if not isinstance(event, Fault):
             self._reading = event
         if self._reading is not None:
-            age_s = self._reading.age_s(time.monotonic() if now is None else now)
-            self._lines = [self._title, *hand_lines(self._reading, self._calibration, self._stats, age_s)]
+            lines = hand_lines(self._reading, self._calibration, self._stats, self._reading.age_s(now))
+            self._lines = [self._title, *lines]
         self._table.show(self._lines)
 
     def end(self) -> None:

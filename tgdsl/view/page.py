@@ -251,10 +251,10 @@ class Page:
         layer = self.scene.layers[0]
         things = "taxels" if isinstance(layer, DiscLayer) else "cells"
         self.panel.status.content = f"t = {self.stage.time:.2f} s · {len(layer.rows.body)} {things}{contacts}"
-        instant, step = self.panel.instant, self.stage.step_index
+        instant = self.panel.instant
         # where a browser has moved the slider since `_react`, its value stays for the next frame
-        if instant is not None and step != self._seen["instant"] == int(instant.value):
-            instant.value = self._seen["instant"] = step
+        if instant is not None and self.stage.step_index != self._seen["instant"] == int(instant.value):
+            instant.value = self._seen["instant"] = self.stage.step_index
 
     # Controls --------------------------------------------------------------------------------------------------------------
 

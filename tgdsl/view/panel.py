@@ -29,7 +29,7 @@ class Panel:
         reading = reading if reading in names else names[0]
         self.problem, self.status = gui.add_markdown(""), gui.add_markdown("")
         self.env = gui.add_slider("environment", 0, stage.num_envs - 1, 1, 0) if stage.num_envs > 1 else None
-        self.instant = gui.add_slider("step", 0, max(1, (stage.num_steps or 2) - 1), 1, 0) if stage.num_steps else None
+        self.instant = gui.add_slider("step", 0, max(1, stage.num_steps - 1), 1, 0) if stage.num_steps else None
         self.paused = gui.add_checkbox("pause", False)
         self.speed = gui.add_slider("speed", 0.1, 4.0, 0.1, 1.0)
         self.time = gui.add_button_group("time", ("step once", "restart"))

@@ -77,7 +77,7 @@ class Stage(ABC):
     groups: Sequence[str] = ()  # names of the groups of observations
     is_gapless = True  # whether `advance` makes each control step, so that sounds are joined
     num_steps: int | None = None  # number of instants of a recorded run; None: the scene goes on without end
-    step_index = 0  # which instant of a recorded run this is
+    step_index: int  # which instant of a recorded run this is
 
     @abstractmethod
     def advance(self) -> None:
