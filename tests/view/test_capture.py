@@ -1,4 +1,4 @@
-"""Pictures and videos of a browser's view, with a client that renders like viser's."""
+"""What a browser saves: pictures, videos and frames, with a client that renders like viser's."""
 
 import io
 import threading
@@ -6,9 +6,13 @@ import time
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
+import viser
 from PIL import Image
 
-from tgdsl.view.page import record, send_picture
+import tgdsl
+from tgdsl.view.page import Page, record, send_picture
+from tgdsl.view.stages import SceneStage
 
 
 class Client:
@@ -65,3 +69,31 @@ def test_a_video_ends_when_it_is_stopped():
     assert video is not None
     with Image.open(io.BytesIO(video)) as frames:
         assert frames.n_frames == len(client.sizes) < 10
+
+
+def test_buttons_act_for_the_browser_that_clicked(document, monkeypatch):
+    clicks, client = {}, Client(num_frames=3)
+    for kind in (viser.GuiButtonHandle, viser.GuiButtonGroupHandle):
+        monkeypatch.setattr(kind, "on_click", lambda handle, act: clicks.update({handle.label: act}))
+    stage = SceneStage(tgdsl.compile(document))
+    page = Page(stage, port=8300)
+
+    def click(label: str, value: str = "") -> None:
+        clicks[label](SimpleNamespace(client=client, target=SimpleNamespace(value=value)))
+        page.run(seconds=0.01)
+
+    click("time", "step once")
+    assert page.panel.paused.value and stage.time == pytest.approx(stage.control_step)
+    click("save last minute")
+    click("time", "restart")
+    assert stage.time == 0
+    click("screenshot")
+    click("video")
+    page.close()
+    stage.close()
+    files = dict(client.files)
+    assert list(files) == ["seen.npz", "view.png", "view.gif"]
+    with np.load(io.BytesIO(files["seen.npz"])) as frames:
+        np.testing.assert_allclose(frames["time"], [0, stage.control_step])
+    with Image.open(io.BytesIO(files["view.gif"])) as video:
+        assert video.n_frames == 2  # the picture was the first of three

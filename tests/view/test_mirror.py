@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import socket
 import threading
 import time
 from collections.abc import Callable
@@ -105,6 +106,24 @@ def test_a_stage_with_nothing_to_draw_is_refused(document):
     touch = tgdsl.compile(bare)
     with pytest.raises(TgdslError, match="to draw"):
         tgdsl.show(touch, tgdsl.simulate(touch, num_envs=1, substeps=5))
+
+
+def test_a_loops_page_shows_its_frames_and_ends_with_its_process(document, capsys):
+    touch = tgdsl.compile(document)
+    sim = tgdsl.simulate(touch, num_envs=1)
+    page = tgdsl.show(touch, sim, port=8360)
+    assert capsys.readouterr().out == f"tgdsl view: {page.url}\n"
+    begin = time.monotonic()
+    with silent_browser(page.url):
+        while page.num_frames < 2 and time.monotonic() < begin + 60:
+            page.update(touch(sim.state()))
+            time.sleep(0.01)
+    assert page.num_frames >= 2
+    page.close()
+    assert page._process.returncode is not None
+    assert page._process.stdin.closed and page._process.stdout.closed
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", int(page.url.rpartition(":")[2])))
 
 
 @pytest.mark.slow
