@@ -126,7 +126,10 @@ def test_a_page_is_served_only_locally_by_default(document):
     with pytest.warns(match=r"served at 0\.0\.0\.0: whoever reaches this machine"):
         page = Page(SceneStage(touch), "0.0.0.0", port=8300)
     socket.create_connection(("127.0.0.2", page.server.get_port())).close()
+    port = page.server.get_port()
     page.close()
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.2", port))
     page.stage.close()
 
 
@@ -169,6 +172,7 @@ def test_a_recorded_run_has_mujocos_poses(document, recording):
     np.testing.assert_allclose(stage.body_poses(0)[0], data.xpos, atol=1e-12)
     assert np.array_equal(stage.readings["touch"].numpy(), readings[7])
     with opened(stage) as page:
+        assert (page.panel.instant.min, page.panel.instant.max) == (0, len(readings) - 1)
         page.panel.instant.value = 3
         page._react()
         assert stage.step_index == 3
@@ -320,11 +324,32 @@ def test_contacts_are_drawn_and_can_be_switched_off(document):
         assert "1 contact, largest" in page.panel.status.content
         ((begin, end),) = page.scene._forces.points
         np.testing.assert_allclose(begin[:2], [0.01, 0], atol=1e-3)
+        assert page.scene._forces.visible
         assert end[2] < begin[2]  # the ball presses the pad down
         page.panel.parts["contacts"].value = False
         page.draw()
         assert not page.scene._points.visible
         assert not page.scene._forces.visible
+
+
+def test_arrows_lead_from_the_taxels_along_their_forces(tmp_path):
+    (tmp_path / "press.xml").write_text(SCENE.replace('"pad" pos="0 0 0.05"', '"pad" pos="0 0 0.05" euler="10 0 30"'))
+    (tmp_path / "press.yaml").write_text(WITHOUT_PROXIMITY)
+    with opened(SceneStage(tgdsl.compile(tmp_path / "press.yaml"))) as page:
+        for _ in range(100):
+            page.stage.advance()
+        page.draw()
+        force = page.stage.readings["touch"][0, :, :3].double().numpy()
+        is_read, turn = np.linalg.norm(force, axis=1) > 1e-3, Rotation.from_euler("XYZ", [10, 0, 30], degrees=True)
+        taxels = turn.apply(page.stage.touch.taxels["touch"]["pos"][is_read]) + [0, 0, 0.05]
+        arrows = page.scene._arrows
+        assert arrows.visible and 0 < is_read.sum() < 16
+        assert np.linalg.norm(arrows.points[:, 0] - taxels, axis=1).max() < 3e-4  # lifted off the surface
+        along, expected = arrows.points[:, 1] - arrows.points[:, 0], turn.apply(force[is_read])
+        np.testing.assert_allclose(along / np.linalg.norm(along), expected / np.linalg.norm(expected), atol=1e-5)  # float32
+        page.panel.parts["arrows"].value = False
+        page.draw()
+        assert not arrows.visible
 
 
 def test_links_groups_and_sensors_can_be_switched_on_and_off(tmp_path):
@@ -350,6 +375,7 @@ def test_links_groups_and_sensors_can_be_switched_on_and_off(tmp_path):
         assert visible_links() == {"pad", "side"}
         page.panel.parts["taxels"].value = False
         assert visible_links() == set()
+        assert [layer.output.name for layer in page.scene.layers] == ["touch"]
         page.panel.also["near"].value = True
         page._react()
         assert [layer.output.name for layer in page.scene.layers] == ["touch", "near"]
