@@ -1,9 +1,18 @@
-"""The table's numbers against sums by hand."""
+"""The tables' numbers against sums by hand."""
 
+import re
+import time
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 
 import tgdsl
+from tgdsl.runtime.xhand1.driver import Reading
+from tgdsl.runtime.xhand1.log.log import Fault
+from tgdsl.runtime.xhand1.wire.protocol import STATE_SIZE, decode_state
+from tgdsl.view.hand_table import HandView
 from tgdsl.view.table import table
 
 SCENE = """
@@ -71,3 +80,51 @@ def test_rounding_is_printed_as_zero(touch):
     small = {"depth": torch.full((1, 3, 1), 0.9e-6), "depth/clean": torch.full((1, 3, 1), 1.1e-6)}
     rest = {name: value[:1] for name, value in readings().items() if name not in small}
     assert table(touch, rest | small)[2].split() == ["palm", "0.000", "0", "1.10e-06", "–", "–", "0.000"]
+
+
+# A hand ------------------------------------------------------------------------------------------------------------------------
+
+
+def hand_lines(capsys, *events: Reading | Fault, now: float | None = None) -> list[str]:
+    """Return what a view prints at the end."""
+    view = HandView(None, "a hand")
+    for event in events:
+        view.show(event, now)
+    view.end()
+    return capsys.readouterr().out.splitlines()
+
+
+def reading_at(now: float, **state: np.ndarray) -> Reading:
+    return Reading(7, now - 0.008, now, replace(decode_state(bytes(STATE_SIZE)), **state))
+
+
+def test_a_hands_table_has_the_age_and_the_rate_of_its_readings(capsys):
+    readings = [reading_at(now) for now in (0.0, 1.9, 2.0, 2.1, 2.2)]  # the last second has four of them, 0.1 s apart
+    title, first, trouble, *_ = hand_lines(capsys, *readings, now=2.45)
+    assert (title, first, trouble) == ("a hand", "reading 7   age 258 ms   10/s   0 failures", "")
+    fault = Fault(2.3, "HandTimeoutError", "no reply")
+    assert hand_lines(capsys, *readings, fault, now=2.45)[1:3] == [
+        "reading 7   age 258 ms   10/s   1 failures",
+        "NO NEW READING: HandTimeoutError: no reply",
+    ]
+    assert hand_lines(capsys, fault) == ["a hand", "not one reading came"]
+
+
+def test_a_readings_age_counts_until_now(capsys):
+    (age,) = re.findall(r"age (\d+) ms", hand_lines(capsys, reading_at(time.monotonic() - 3.0))[1])
+    assert 3008 <= int(age) < 8000
+
+
+def test_a_hands_table_has_forces_with_bars_and_joints_with_errors(capsys):
+    force, error = np.zeros((5, 3), np.int16), np.zeros((12, 3), np.uint16)
+    force[1], error[2, 1] = (3, 4, 12), 0x21
+    position = np.linspace(0, 1.1, 12).astype(np.float32)
+    lines = hand_lines(capsys, reading_at(0.0, total_force=force, joint_error=error, position=position), now=0.0)
+    rows = [line.split() for line in lines]
+    index = rows[5]
+    assert index[:5] == ["index", "3.00", "4.00", "12.00", "13.00"]
+    eighths = 8 * index[6].count("█") + " ▏▎▍▌▋▊▉".find(index[6][-1])
+    assert eighths == round(8 * 32 * 13 / 255)
+    joints = rows[-12:]
+    np.testing.assert_allclose([float(row[-4]) for row in joints if row[-1] == "–"], np.delete(position, 2), atol=5e-4)
+    assert joints[2][-3:] == ["0x0000", "0x0021", "0x0000"]
