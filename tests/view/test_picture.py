@@ -126,6 +126,19 @@ def test_summary_adds_forces_but_not_depths() -> None:
     assert contact.summary() == "Σ 2"
 
 
+def test_the_view_has_a_dot_at_each_taxel_and_hotter_ones_last(touch, sim) -> None:
+    """Pixels of an orthographic view are a linear map of positions: fit it to all dots but check each."""
+    depth = 1e-4 * (1.0 + torch.randperm(36, generator=torch.Generator().manual_seed(0)))
+    axes = drawing(touch, sim, {"depth": depth.expand(2, 36)[..., None]}).axes[0]
+    (dots,) = (part for part in axes.collections if part.get_array() is not None)
+    order = depth.argsort().numpy()
+    np.testing.assert_allclose(dots.get_array(), 1e3 * depth[order], rtol=1e-6)
+    places = np.column_stack([touch.taxels["depth"]["pos"][order], np.ones(36)])
+    pixels = np.asarray(dots.get_offsets())
+    np.testing.assert_allclose(places @ np.linalg.lstsq(places, pixels, rcond=None)[0], pixels, atol=1e-6)
+    assert np.ptp(pixels, axis=0).min() > 50
+
+
 # Camera and pixels ---------------------------------------------------------------------------------------------------
 
 

@@ -251,6 +251,12 @@ def test_a_picture_is_reproducible(hand: Drawn, tmp_path: Path) -> None:
     assert matplotlib.image.imread(first).shape[0] == HEIGHT
 
 
+def test_a_picture_is_as_high_as_the_command_says(hand: Drawn) -> None:
+    """`tgdsl render --help`: by default 750 pixels."""
+    figure = drawing(hand[0], {"few": hand[1]["few"]})
+    assert figure.get_figheight() * figure.dpi == pytest.approx(750)
+
+
 def test_the_hand_fills_a_panel_of_the_given_size(hand: Drawn, tmp_path: Path) -> None:
     """In the middle, ink comes within 2.5 pixels of the intended margins."""
     model, layouts = hand

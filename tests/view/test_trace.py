@@ -43,10 +43,14 @@ def touch(tmp_path):
 
 @pytest.fixture
 def trace(touch):
+    return trace_of(touch, READ)
+
+
+def trace_of(touch, read):
     trace = TouchTrace(touch, touch.outputs[0], 3)
-    for step, reading in enumerate(READ):
+    for step, reading in enumerate(read):
         trace.add(step + 1, {"touch": reading})
-    trace.add(3, {"touch": READ[0]})  # beyond the last step
+    trace.add(3, {"touch": read[0]})  # beyond the last step
     return trace
 
 
@@ -87,3 +91,7 @@ def test_bars_are_proportional_to_the_sums_of_links(trace):
     assert not frame.any() and not empty[:, 300:].any() and not empty[:100].any()
     lengths = [(bars.draw(frame, step) != empty).any(axis=2)[[-27, -9]].sum(axis=1) for step in (1, 2)]
     np.testing.assert_allclose(lengths, 172 * np.array([[6, 2], [5, 0]]) / 6, atol=1)
+
+
+def test_small_forces_fill_the_bars_too(touch):
+    np.testing.assert_allclose(trace_of(touch, 0.05 * READ).bars().parts, np.array([[0, 0], [6, 2], [5, 0]]) / 6, rtol=1e-6)
