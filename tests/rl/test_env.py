@@ -17,7 +17,7 @@ from tgdsl.rl.sensors import PolicyTouch
 from tgdsl.runtime import connect
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.connect import SOURCES
-from tgdsl.runtime.xhand1.source import VelocityFilter
+from tgdsl.runtime.xhand1.source import TIME_CONSTANT_S, VelocityFilter
 
 STEPS = 12
 
@@ -221,7 +221,7 @@ def test_two_processes_give_the_same_environments_as_one(make):
 def test_measured_velocities_match_a_hands_driver(make):
     """They follow from positions at control steps and start at rest in each episode; privileged velocities stay exact."""
     env = make(more=RANDOM + "episode: 0.2 s\njoint_vel: measured\n")
-    filters, times = [VelocityFilter(0.02) for _ in range(4)], np.zeros(4)
+    filters, times = [VelocityFilter(TIME_CONSTANT_S) for _ in range(4)], np.zeros(4)
     obs = env.reset(seed=3)
     for action in [None, *actions(env, 2 * STEPS - 3)]:
         if action is not None:

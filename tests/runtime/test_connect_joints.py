@@ -11,7 +11,7 @@ from tgdsl.errors import ObservationError
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.observe import HandObserver
-from tgdsl.runtime.xhand1.source import HandSample, VelocityFilter
+from tgdsl.runtime.xhand1.source import TIME_CONSTANT_S, HandSample, VelocityFilter
 from tgdsl.runtime.xhand1.wire.errors import MotionError
 
 PLAIN = Calibration.none()
@@ -32,7 +32,7 @@ def instant(touch):
 
 
 def samples(num=4):
-    velocity_filter = VelocityFilter(0.02)
+    velocity_filter = VelocityFilter(TIME_CONSTANT_S)
     readings = random_readings(np.arange(num) * 0.02 + 1.0)
     return [HandSample.of(reading, PLAIN, velocity_filter, reading.requested_at) for reading in readings]
 
@@ -101,7 +101,7 @@ def test_a_log_gives_joint_observations(tmp_path):
         while not env.is_over:
             env.step()
             observations.append(env.observe()["policy"])
-    velocity_filter = VelocityFilter(0.02)
+    velocity_filter = VelocityFilter(TIME_CONSTANT_S)
     for row, reading in zip(observations, readings, strict=True):
         position = reading.state.position
         velocity = velocity_filter.update(reading.requested_at, position.astype(np.float64)).astype(np.float32)

@@ -20,6 +20,7 @@ from tgdsl.rl.draws import Draws
 from tgdsl.rl.rotations import Quat, between, inverse, product, six_numbers
 from tgdsl.rl.spec import ProprioSpec
 from tgdsl.rl.task import Features, HandNow, Now, Part, Setup
+from tgdsl.runtime.xhand1.source import TIME_CONSTANT_S
 
 GoalPart = Literal["orientation", "difference", "angle"]  # parts of an observed goal, an orientation
 
@@ -27,10 +28,10 @@ GoalPart = Literal["orientation", "difference", "angle"]  # parts of an observed
 class MeasuredVelocity:
     """Joint velocities [rad/s] as an XHand1's driver has them: `tgdsl.runtime.xhand1.source.VelocityFilter`, batched."""
 
-    def __init__(self, joint_pos: Float[Tensor, "env joint"], control_step: float, time_constant: float = 0.02):
+    def __init__(self, joint_pos: Float[Tensor, "env joint"], control_step: float):
         self._before, self.value = joint_pos.clone(), torch.zeros_like(joint_pos)
         self._control_step = control_step
-        self._share = -math.expm1(-control_step / time_constant)
+        self._share = -math.expm1(-control_step / TIME_CONSTANT_S)
         self.memory = {"before": self._before, "value": self.value}  # live tensors
 
     def update(self, joint_pos: Float[Tensor, "env joint"]) -> None:

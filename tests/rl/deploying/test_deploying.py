@@ -13,7 +13,7 @@ from tgdsl.rl.deploying.deploy import Deployment, deploy
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.evaluation import SEED, evaluate
 from tgdsl.rl.playing.policy import policy_for, read_policy
-from tgdsl.runtime.xhand1.source import VelocityFilter
+from tgdsl.runtime.xhand1.source import TIME_CONSTANT_S, VelocityFilter
 from tgdsl.runtime.xhand1.wire.protocol import JOINTS
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
@@ -154,7 +154,7 @@ def test_a_log_is_replayed_without_motion(task, policy, tmp_path):
     names = deployment.prepared.moved.names
     ids = [JOINTS.index(name.removeprefix("right_hand_")) for name in names]
     assert [f"right_hand_{name}" for name in ORDER if f"right_hand_{name}" in names] == list(names) and len(names) == 6
-    speeds, target = VelocityFilter(0.02), np.clip(readings[0].state.position[ids].astype(np.float64), -1, 1)
+    speeds, target = VelocityFilter(TIME_CONSTANT_S), np.clip(readings[0].state.position[ids].astype(np.float64), -1, 1)
     assert 15 < len(moments) <= 20
     for moment, reading in zip(moments, readings, strict=False):
         position, proprio = reading.state.position, moment.obs["proprio"][0].numpy()

@@ -11,7 +11,7 @@ from tgdsl.module.module import TactileModule
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import Reading
 from tgdsl.runtime.xhand1.observe import HandObserver, finger_of, hand_terms, warn_of_noise
-from tgdsl.runtime.xhand1.source import HandSample, VelocityFilter
+from tgdsl.runtime.xhand1.source import TIME_CONSTANT_S, HandSample, VelocityFilter
 from tgdsl.runtime.xhand1.wire.protocol import HandState
 
 AGGREGATES = [
@@ -44,7 +44,7 @@ def state(total=None, taxel=None) -> HandState:
 
 
 def sample(total=None, taxel=None, calibration: Calibration = PLAIN) -> HandSample:
-    return HandSample.of(Reading(1, 0.0, 0.1, state(total, taxel)), calibration, VelocityFilter(0.0), 0.0)
+    return HandSample.of(Reading(1, 0.0, 0.1, state(total, taxel)), calibration, VelocityFilter(TIME_CONSTANT_S), 0.0)
 
 
 def compiled(tmp_path, terms, xml=None, dtype=torch.float32, side="right", **sensors) -> TactileModule:

@@ -48,8 +48,8 @@ def test_the_filter_damps_and_delays_a_sine_to_first_order():
     assert filtered[times > 1] == pytest.approx(expected[times > 1], abs=2e-3 * omega)
 
 
-def test_without_a_time_constant_velocities_are_differences():
-    velocity_filter = VelocityFilter(0.0)
+def test_the_filter_starts_at_rest_and_a_time_that_is_not_later_changes_nothing():
+    velocity_filter = VelocityFilter(1e-3)  # e⁻⁵⁰⁰ of a difference is left
     assert velocity_filter.update(1.0, np.array([5.0])) == [0.0]
     assert velocity_filter.update(1.5, np.array([6.0])) == [2.0]
     assert velocity_filter.update(1.5, np.array([9.0])) == [2.0]

@@ -25,6 +25,8 @@ from tgdsl.runtime.xhand1.driver import Reading, XHand1
 from tgdsl.runtime.xhand1.wire.errors import HandError, HandTimeoutError, MotionError
 from tgdsl.tensors.env_ids import EnvIds, env_indices
 
+TIME_CONSTANT_S = 0.02  # of the filter of joint speeds; policies learn with `joint_vel: measured` what it does [s]
+
 
 class VelocityFilter:
     """Differences of successive angles through a first-order low-pass filter: v ← v + (1 − exp(−Δt/τ)) (Δq/Δt − v).
@@ -34,7 +36,7 @@ class VelocityFilter:
     """
 
     def __init__(self, time_constant_s: float):
-        """Start at rest, with a time constant τ [s]; 0: plain differences."""
+        """Start at rest, with a time constant τ [s]."""
         self._time_constant_s = time_constant_s
         self.reset()
 
@@ -52,7 +54,7 @@ class VelocityFilter:
             self._velocity = np.zeros(len(position))
         elif time_s > self._time_s:
             elapsed = time_s - self._time_s
-            share = 1.0 if self._time_constant_s == 0 else -math.expm1(-elapsed / self._time_constant_s)
+            share = -math.expm1(-elapsed / self._time_constant_s)
             self._velocity = self._velocity + share * ((position - self._position) / elapsed - self._velocity)
         else:
             return self._velocity
@@ -109,9 +111,9 @@ class HandSource(Closable, ABC):
     num_envs = 1
     num_late_steps = 0  # steps that began after they should have ended
 
-    def __init__(self, calibration: Calibration | None, velocity_time_constant: float):
+    def __init__(self, calibration: Calibration | None):
         self.calibration = calibration or Calibration.none()
-        self._velocity = VelocityFilter(velocity_time_constant)
+        self._velocity = VelocityFilter(TIME_CONSTANT_S)
 
     @property
     @abstractmethod
@@ -170,7 +172,6 @@ class XHand1Source(HandSource):
         *,
         control_step: float,
         calibration: Calibration | None = None,
-        velocity_time_constant: float = 0.02,
         read_timeout_s: float | None = None,
     ):
         """Take an open hand, which `close` closes.
@@ -179,13 +180,12 @@ class XHand1Source(HandSource):
             hand: The hand.
             control_step: Duration of one control step [s].
             calibration: What its counts mean; default: they stay counts.
-            velocity_time_constant: Time constant of the filter of joint speeds [s].
             read_timeout_s: How long to wait for a new reading after a step [s]; default: as `hand.read`.
         """
         if not 0 < control_step < math.inf:
             raise HandError(f"a control step of {control_step:g} s, expected a finite time above 0")
         refuse_beyond_watchdog(control_step, hand.watchdog_s)
-        super().__init__(calibration, velocity_time_constant)
+        super().__init__(calibration)
         self.hand, self._control_step, self._read_timeout_s = hand, control_step, read_timeout_s
         self._step_ends_at = time.monotonic()
         self._target: np.ndarray | None = None

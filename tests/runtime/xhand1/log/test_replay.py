@@ -20,7 +20,7 @@ from tgdsl.runtime.xhand1.emulator.emulator import TipForces
 from tgdsl.runtime.xhand1.log.log import Fault, LogError, LogWriter
 from tgdsl.runtime.xhand1.log.replay import ReplayOverError, ReplaySource
 from tgdsl.runtime.xhand1.motion import MotionLimits
-from tgdsl.runtime.xhand1.source import HandSample, XHand1Source
+from tgdsl.runtime.xhand1.source import TIME_CONSTANT_S, HandSample, XHand1Source
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandDisconnectedError, HandError, HandTimeoutError
 from tgdsl.runtime.xhand1.wire.protocol import saturated
@@ -58,7 +58,7 @@ def run_live(path) -> list[HandSample | Fault]:
         XHand1.open(emulator.device, motion=LIMITS, timing=SerialTiming(reply_timeout_s=2.0, silence_s=1.0)) as hand,
         LogWriter(path, calibration=NEWTON) as log,
     ):
-        source = XHand1Source(hand, control_step=0.02, calibration=NEWTON, velocity_time_constant=0.05)
+        source = XHand1Source(hand, control_step=0.02, calibration=NEWTON)
         live.append(source.sample())
         log.add(source.sample().reading)
         while sum(isinstance(event, HandSample) for event in live) < 50 or not any(isinstance(event, Fault) for event in live):
@@ -79,7 +79,7 @@ def run_live(path) -> list[HandSample | Fault]:
 def test_a_replay_gives_the_live_samples(tmp_path):
     live = run_live(tmp_path / "a.npz")
     replayed: list[HandSample | Fault] = []
-    with ReplaySource(tmp_path / "a.npz", speed=math.inf, velocity_time_constant=0.05) as replay:
+    with ReplaySource(tmp_path / "a.npz", speed=math.inf) as replay:
         replayed.append(replay.sample())
         while not replay.is_over:
             try:
@@ -333,13 +333,14 @@ def test_reset_in_a_gap_raises_the_recorded_error(tmp_path):
 
 def test_a_sample_matches_the_logged_state(tmp_path):
     readings = random_readings(np.array([1.0, 1.01]))
-    source: Source = ReplaySource(write_log(tmp_path / "a.npz", readings), speed=math.inf, velocity_time_constant=0.0)
+    source: Source = ReplaySource(write_log(tmp_path / "a.npz", readings), speed=math.inf)
     assert isinstance(source, ReplaySource)
     source.step(np.full(99, 7.0))
     sample, before, state = source.sample(), readings[0].state, readings[1].state
     assert (source.num_envs, source.control_step, sample.units) == (1, pytest.approx(0.01), "counts")
     assert sample.joint_pos.numpy()[0].tobytes() == state.position.tobytes()
-    speed = (state.position.astype(np.float64) - before.position) / (readings[1].requested_at - readings[0].requested_at)
+    elapsed = readings[1].requested_at - readings[0].requested_at
+    speed = (1.0 - np.exp(-elapsed / TIME_CONSTANT_S)) * (state.position.astype(np.float64) - before.position) / elapsed
     assert sample.joint_vel.numpy()[0] == pytest.approx(speed, rel=1e-6)
     assert (sample.tip_force.numpy()[0] == state.total_force).all()
     assert (sample.taxel_counts.numpy()[0] == state.taxel_force).all()

@@ -43,7 +43,6 @@ class ReplaySource(HandSource):
         control_step: float | None = None,
         speed: float = 1.0,
         calibration: Calibration | None = None,
-        velocity_time_constant: float = 0.02,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ):
@@ -54,7 +53,6 @@ class ReplaySource(HandSource):
             control_step: Duration of one control step, on the log's clock [s]; default: one reading per step.
             speed: How much faster than it was: 1 is the original timing, `math.inf` as fast as possible.
             calibration: What the counts mean; default: what the log says, and counts if it says nothing.
-            velocity_time_constant: Time constant of the filter of joint speeds [s].
             clock: Seconds that only go forward.
             sleep: Waits for some seconds.
         """
@@ -63,7 +61,7 @@ class ReplaySource(HandSource):
         if not (control_step is None or 0 < control_step < math.inf):
             raise TgdslError(f"control_step is {control_step:g} s, expected more than 0, and a finite time")
         self.log = open_log(path)
-        super().__init__(calibration or self.log.calibration, velocity_time_constant)
+        super().__init__(calibration or self.log.calibration)
         self._speed, self._control_step = speed, control_step
         self._clock, self._sleep = clock, sleep
         self._fault_times = np.array([fault.time for fault in self.log.faults])
