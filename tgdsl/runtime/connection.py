@@ -51,7 +51,7 @@ class Source(Protocol):
 class Connection(Closable, ABC):
     """A source, as a policy sees it. Use it as a context manager, or call `close`.
 
-    A kind of source supplies `read`, and where it differs `send`, `restart` and `concerns`.
+    A kind of source supplies `read`, and where it differs `send` and `restart`.
 
     Attributes:
         source: The source: a `BatchSimulation`, an `XHand1Source`, an `EmulatedSource`, a `ReplaySource` or another.
@@ -73,10 +73,6 @@ class Connection(Closable, ABC):
     def restart(self, env_ids: EnvIds | None) -> None:
         """Reset the source, and forget past observations."""
         self.source.reset(env_ids)
-
-    def concerns(self, env_ids: EnvIds) -> bool:
-        """Return whether a reset of these environments does anything; if not, the last observation stays."""
-        return True
 
     @property
     def num_envs(self) -> int:
@@ -127,8 +123,6 @@ class Connection(Closable, ABC):
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
         """Restart some environments (default: all): a simulation from its keyframe, a hand where it is, passive."""
-        if env_ids is not None and not self.concerns(env_ids):
-            return
         self._groups, self._is_read = None, False
         self.restart(env_ids)
         self._is_read = True

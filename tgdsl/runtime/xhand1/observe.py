@@ -273,12 +273,14 @@ class HandConnection(Connection):
         self._hand.step(target)
         self._observer.note(control)
 
+    def reset(self, env_ids: EnvIds | None = None) -> None:
+        """Restart the hand, passive, or the log; without environments, the last observation stays."""
+        if env_ids is None or is_chosen(env_ids):
+            super().reset(env_ids)
+
     def restart(self, env_ids: EnvIds | None) -> None:
         self._hand.reset(env_ids)
         self._observer.reset()
-
-    def concerns(self, env_ids: EnvIds) -> bool:
-        return is_chosen(env_ids)
 
     def resume(self) -> None:
         self._hand.resume()
