@@ -50,6 +50,7 @@ _ROOM_TEMPERATURE = 25
 _COUNTS_PER_TURN = 4096
 _IDLE_S = 0.05
 _KEPT_REQUESTS = 20_000
+_BYTE_S = 10 / BAUD  # 10 bits carry a byte
 _CHUNK = 124  # bytes that come out of the line at a time: 0.4 ms at 3 Mbaud
 
 
@@ -147,18 +148,18 @@ def _counts(force: Float[np.ndarray, "*batch 3"]) -> np.ndarray:
 class EmulatedLine:
     """The line between a host and an emulated hand: bytes in, bytes out at the speed of its baud rate. Time is passed in."""
 
-    def __init__(self, hand: EmulatedHand, *, baud: int = BAUD, turnaround_s: float = 0.0002):
-        """Connect a hand that answers `turnaround_s` after a request's last byte [s], on a line of `baud` bits per second."""
+    def __init__(self, hand: EmulatedHand, *, turnaround_s: float = 0.0002):
+        """Connect a hand that answers `turnaround_s` after a request's last byte [s], on a line of `BAUD`."""
         self.hand = hand
         self.requests: deque[tuple[float, Frame]] = deque(maxlen=_KEPT_REQUESTS)  # the latest that arrived, and when [s]
-        self._byte_s, self._turnaround_s = 10 / baud, turnaround_s
+        self._turnaround_s = turnaround_s
         self.cut()
 
     def hear(self, data: bytes, now: float) -> None:
         """Take bytes that the host has sent; the hand answers its requests."""
         for frame in self._parser.feed(data):
             self.requests.append((now, frame))
-            self.answer(frame, now + (OVERHEAD + len(frame.payload)) * self._byte_s)
+            self.answer(frame, now + (OVERHEAD + len(frame.payload)) * _BYTE_S)
 
     def answer(self, frame: Frame, arrived_at: float) -> None:
         """Let the hand answer a request that arrived at a time [s]."""
@@ -173,12 +174,12 @@ class EmulatedLine:
         start = max(ready_at, self._free_at)
         if self._chunks and start == self._free_at and len(self._chunks[-1][1]) < _CHUNK:
             _, begun = self._chunks.pop()
-            start -= len(begun) * self._byte_s
+            start -= len(begun) * _BYTE_S
             raw = begun + raw
         for at in range(0, len(raw), _CHUNK):
             chunk = raw[at : at + _CHUNK]
-            self._chunks.append((start + (at + len(chunk)) * self._byte_s, chunk))
-        self._free_at = start + len(raw) * self._byte_s
+            self._chunks.append((start + (at + len(chunk)) * _BYTE_S, chunk))
+        self._free_at = start + len(raw) * _BYTE_S
 
     def due(self, now: float) -> bytes:
         """Return, and forget, the bytes that have reached the host by now."""
