@@ -149,9 +149,9 @@ def load_calibration(path: Path) -> Calibration:
     return _calibration(read_spec(path, CalibrationSpec, _REQUIRED)[0])
 
 
-def parse_calibration(text: str, name: str) -> Calibration:
-    """Read the text of a calibration file, whose mistakes then go by a name."""
-    return _calibration(parse_spec(text.encode(), name, CalibrationSpec, _REQUIRED)[0])
+def parse_calibration(text: str) -> Calibration:
+    """Read the text of a calibration, as a log holds it."""
+    return _calibration(parse_spec(text.encode(), "calibration", CalibrationSpec, _REQUIRED)[0])
 
 
 def _calibration(spec: CalibrationSpec) -> Calibration:

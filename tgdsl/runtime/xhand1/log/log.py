@@ -158,7 +158,7 @@ def open_log(path: str | Path) -> HandLog:
             return HandLog(
                 path,
                 None if about["hand"] is None else HandIdentity.from_json(about["hand"]),
-                None if about["calibration"] is None else parse_calibration(about["calibration"], "calibration"),
+                None if about["calibration"] is None else parse_calibration(about["calibration"]),
                 float(about["started_at"]),
                 *(_array(archive, name) for name in TIMES),
                 faults=tuple(Fault(float(t), str(kind), str(text)) for t, kind, text in zip(*parts, strict=True)),
