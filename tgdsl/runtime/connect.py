@@ -41,7 +41,7 @@ from tgdsl.scene.scene import scene_model
 
 CONTROL_STEP = 0.02
 MUJOCO = "mujoco"  # what users call the kind "simulation" where they name a simulator
-_USB_PORTS = ("/dev/ttyUSB", "/dev/ttyACM", "/dev/cu.usb", "COM")
+_USB_PORTS = ("/dev/ttyUSB", "/dev/ttyACM", "/dev/cu.usb")
 _Calibration = Calibration | str | Path | None
 _Scene = SteppedScene | None
 

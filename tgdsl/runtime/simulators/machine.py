@@ -25,10 +25,7 @@ def checked_device(device: str, supported: Sequence[str]) -> torch.device:
 
 
 def refuse_beyond_memory(what: str, num_bytes: int) -> None:
-    """Raise an error if something needs more memory than this computer has; where that is not known, do nothing."""
-    try:
-        there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, OSError, ValueError):  # no such call on Windows
-        return
-    if num_bytes > there > 0:
+    """Raise an error if something needs more memory than this computer has."""
+    there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if num_bytes > there:
         raise SimulationError(f"{what} need about {num_bytes / 1e9:.3g} GB, and this computer has {there / 1e9:.3g} GB")
