@@ -149,11 +149,10 @@ def read_grasps(file: Path, scene: str, object: str) -> Grasps:
 
 
 class Drawn(NamedTuple):
-    """A grasp of each environment: MuJoCo's `qpos` and `ctrl`, contact fields of a state, and the object's world pose."""
+    """A grasp of each environment: MuJoCo's `qpos` and `ctrl`, contact fields of a state, and the object's orientation."""
 
     values: StateValues
     contacts: dict[str, Tensor]
-    pos: Float[Tensor, "env 3"]
     quat: Float[Tensor, "env 4"]
 
 
@@ -163,8 +162,7 @@ class GraspTable:
     qpos: Float[Tensor, "grasp nq"]
     ctrl: Float[Tensor, "grasp nu"]  # controls of all actuators, with which the hand presses
     contacts: dict[str, Tensor]  # contact and force fields of a state that the module reads, by name, (grasp, …)
-    pos: Float[Tensor, "grasp 3"]  # position of the object's body in each, in the world [m]
-    quat: Float[Tensor, "grasp 4"]  # its orientation, w, x, y, z
+    quat: Float[Tensor, "grasp 4"]  # orientation of the object's body in each, in the world: w, x, y, z
     first: Int[Tensor, " env"]  # the first grasp of each environment's variant
     count: Int[Tensor, " env"]  # number of that variant's grasps
 
@@ -190,17 +188,17 @@ class GraspTable:
         self.count = torch.from_numpy(np.searchsorted(variants_in_order, variants, side="right")).to(device) - self.first
         self._draws = draws
         self.contacts = self._evaluated(sim, body, variants)
-        self.pos, self.quat = self.contacts.pop("pos"), self.contacts.pop("quat")
+        self.quat = self.contacts.pop("quat")
 
     def draw(self, episode: Int[Tensor, " env"]) -> Drawn:
         """Return a grasp of each environment, drawn by its count of episodes."""
         share = self._draws.uniform("grasp", episode, 1)[:, 0]
         index = self.first + torch.minimum((share * self.count).to(torch.int64), self.count - 1)
         contacts = {name: value[index] for name, value in self.contacts.items()}
-        return Drawn({"qpos": self.qpos[index], "ctrl": self.ctrl[index]}, contacts, self.pos[index], self.quat[index])
+        return Drawn({"qpos": self.qpos[index], "ctrl": self.ctrl[index]}, contacts, self.quat[index])
 
     def _evaluated(self, sim: Simulation, body: str, variants: Int[np.ndarray, " env"]) -> dict[str, Tensor]:
-        """Return the contact fields and the object's pose in each grasp; zeros for variants without an environment."""
+        """Return the contact fields and the object's orientation in each grasp; zeros for variants without an environment."""
         rank, num = np.zeros_like(variants), np.zeros_like(variants)
         for v in np.unique(variants):
             rank[variants == v], num[variants == v] = np.arange((variants == v).sum()), (variants == v).sum()
@@ -210,8 +208,8 @@ class GraspTable:
         for i in range(int((self.count / step).ceil().max())):
             index = self.first + torch.minimum(place + i * step, self.count - 1)
             sim.reset(contacts="evaluate", qpos=self.qpos[index], ctrl=self.ctrl[index])
-            state, motion = sim.state(), sim.watched().body(body)
-            each = {name: getattr(state, name) for name in FIELDS} | {"pos": motion.pos, "quat": motion.quat}
+            state, quat = sim.state(), sim.watched().body(body).quat
+            each = {name: getattr(state, name) for name in FIELDS} | {"quat": quat}
             for name, value in each.items():
                 if value is not None:
                     empty = torch.zeros((len(self.qpos), *value.shape[1:]), dtype=value.dtype, device=device)
