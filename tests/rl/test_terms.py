@@ -1,6 +1,6 @@
 """Terms that a document adds to its task: rewards, terminations, observations, including user-defined ones."""
 
-from importlib import import_module
+from pkgutil import resolve_name
 
 import mujoco
 import numpy as np
@@ -301,8 +301,7 @@ def test_parameters_of_shared_terms_are_keys_of_the_document():
 
 def test_shared_terms_appear_once_in_each_task():
     """Terms of `HandTask` are in each task's reward and document, after the task's own terms unless it redefines them."""
-    for module, name in TASKS.values():
-        task = getattr(import_module(module), name)
+    for task in map(resolve_name, TASKS.values()):
         assert HandTask.terms.keys() <= task.terms.keys() == task.Spec.model_fields["rewards"].annotation.model_fields.keys()
     assert list(HotBall.terms) == ["approach", "contact", "progress", "latched", "lost", *HandTask.terms]
     assert GripForce.terms["action_rate"].weight == -0.01 != HotBall.terms["action_rate"].weight

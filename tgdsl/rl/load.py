@@ -7,9 +7,9 @@ import importlib.util
 import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
 from os import PathLike
 from pathlib import Path
+from pkgutil import resolve_name
 from types import FunctionType
 from typing import Any, TypeVar, cast
 
@@ -164,10 +164,10 @@ def _class_of(
     source: Source, folder: Path, place: Place, name: str, base: type[C], known: Mapping[str, Any], which: str
 ) -> type[C]:
     """Return the class that a document names: of `known`, or as `package.module:Class` or `file.py:Class`."""
-    module, colon, class_ = name.partition(":")
-    if name in known:
-        entry = known[name]
-        return getattr(importlib.import_module(entry[0]), entry[1]) if isinstance(entry, tuple) else entry
+    entry = known.get(name, name)
+    if not isinstance(entry, str):
+        return entry
+    module, colon, class_ = entry.partition(":")
     if not colon:
         hint = f"{did_you_mean(name, known, which)}; one of your own is package.module:Class or file.py:Class"
         raise SpecError([source.problem(place, f'there is no {which[:-1]} "{name}"', hint)])
@@ -222,9 +222,7 @@ def _user_module(name: str, folder: Path) -> Any:
 
 def task_schema() -> dict[str, Any]:
     """Return the schema of all tasks of tgdsl by name; a user's task has the keys that all tasks share."""
-    specs: dict[str, type[TaskSpec]] = {
-        name: getattr(import_module(place), class_).Spec for name, (place, class_) in TASKS.items()
-    }
+    specs: dict[str, type[TaskSpec]] = {name: resolve_name(place).Spec for name, place in TASKS.items()}
     definitions: dict[str, Any] = {}
     for model in (TaskSpec, *dict.fromkeys(specs.values())):
         schema = model.model_json_schema(ref_template="#/$defs/{model}")

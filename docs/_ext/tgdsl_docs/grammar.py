@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from importlib import import_module
+from pkgutil import resolve_name
 from typing import Any
 
 from tgdsl.rl.spec import TaskSpec
@@ -49,8 +49,8 @@ def grammar_pages() -> dict[str, str]:
 
 def _tasks() -> list[tuple[str, Schema]]:
     named: list[tuple[str, Schema]] = [("Every task", TaskSpec.model_json_schema())]
-    for name, (place, class_) in TASKS.items():
-        named.append((f"`{name}`", getattr(import_module(place), class_).Spec.model_json_schema()))
+    for name, place in TASKS.items():
+        named.append((f"`{name}`", resolve_name(place).Spec.model_json_schema()))
     return named
 
 
