@@ -31,7 +31,7 @@ from tgdsl.errors import SimulationError
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.warp import WarpSimulation
 from tgdsl.runtime.warp.simulation import constraint_rows
-from tgdsl.runtime.warp.stream import GraphedCall, WarpStream, _no_collection
+from tgdsl.runtime.warp.stream import GraphedCall, WarpStream, no_collection
 
 
 class PretendedGpu(WarpStream):
@@ -147,7 +147,7 @@ def test_a_call_is_captured_the_third_time_and_then_replayed():
 
 def test_no_garbage_is_collected_while_a_call_is_captured():
     """Else an array of Warp's that is freed by chance would break the capture."""
-    with _no_collection():
+    with no_collection():
         assert not gc.isenabled()
     assert gc.isenabled()
 

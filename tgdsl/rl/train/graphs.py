@@ -9,6 +9,8 @@ from typing import Generic, TypeVar
 
 import torch
 
+from tgdsl.runtime.warp.stream import no_collection
+
 T = TypeVar("T")
 EAGER_CALLS = 2  # calls before the captured one: they load kernels and allocate persistent tensors
 
@@ -53,21 +55,16 @@ class Captured(Generic[T]):
         return outputs
 
     def _capture(self, stream: torch.cuda.Stream) -> tuple[torch.cuda.CUDAGraph, T]:
-        """Capture the work without doing it; garbage collection is off, as Warp's deallocations break a capture."""
+        """Capture the work without doing it."""
         graph = torch.cuda.CUDAGraph()
         gc.collect()
-        was_enabled = gc.isenabled()
-        gc.disable()
-        try:
-            with (
-                _matmul(self._has_tf32),
-                torch.inference_mode(False),
-                torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
-            ):
-                outputs = self._body()
-        finally:
-            if was_enabled:
-                gc.enable()
+        with (
+            no_collection(),
+            _matmul(self._has_tf32),
+            torch.inference_mode(False),
+            torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
+        ):
+            outputs = self._body()
         return graph, outputs
 
 

@@ -69,7 +69,7 @@ class WarpStream:
         """
         stream = self._warp.stream_from_torch(torch.cuda.current_stream(self.device))
         with (
-            _no_collection(),
+            no_collection(),
             self._quiet(),
             torch.inference_mode(False),
             torch.no_grad(),
@@ -92,7 +92,7 @@ class WarpStream:
             self.is_in_own_graph = True
             try:
                 with (
-                    _no_collection(),
+                    no_collection(),
                     torch.cuda.graph(graph, stream=self._stream, capture_error_mode="thread_local"),
                     self._warp.ScopedCapture(stream=self._warp_stream, external=True),
                 ):
@@ -120,7 +120,7 @@ class WarpStream:
 
 
 @contextlib.contextmanager
-def _no_collection() -> Iterator[None]:
+def no_collection() -> Iterator[None]:
     """Keep garbage from being collected: to free one of Warp's arrays breaks a capture."""
     was_enabled = gc.isenabled()
     gc.disable()
