@@ -74,17 +74,16 @@ class Normalisation(EmpiricalNormalization):
 class RewardNormalisation(EmpiricalDiscountedVariationNormalization):
     """rsl_rl's normalisation of intrinsic rewards: divided by the standard deviation of their discounted sums."""
 
-    def __init__(self, num_envs: int, eps: float = 1e-2, gamma: float = 0.99, until: int | None = None):
-        super().__init__([], eps, gamma, until)
-        self.emp_norm = Normalisation([], eps, until)
-        self.gamma = gamma
+    def __init__(self, num_envs: int, until: int):
+        super().__init__([], until=until)
+        self.emp_norm = Normalisation([], until=until)
         self.register_buffer("total", torch.zeros(num_envs), persistent=False)
 
     def forward(self, rew: Float[Tensor, " row"]) -> Float[Tensor, " row"]:
         """Return rewards normalised; in training mode they update the moments first."""
         total: Tensor = self.total  # pyright: ignore[reportAssignmentType]
         if self.training:
-            total.mul_(self.gamma).add_(rew)
+            total.mul_(self.disc_avg.gamma).add_(rew)
             self.emp_norm.update(total)
         std = self.emp_norm._std.to(rew.dtype)
         return torch.where(std > 0, rew / std, rew).view_as(rew)
