@@ -101,7 +101,7 @@ class InPalmRotate(terms.HandTask[InPalmRotateSpec]):
     @reward_term(-100.0, "1/(m s)")
     def object_distance(self, now: Now) -> Float[Tensor, " env"]:
         """Distance of the object from where it started beyond `free_distance`, max(0, |p − p_0| − r)."""
-        return (self._distance(now) - self.spec.free_distance).clamp(min=0.0)
+        return (vector_norm(now.object.pos - self.start_pos, dim=1) - self.spec.free_distance).clamp(min=0.0)
 
     contact_force = terms.ContactForce.of_task(-5.0, max_force="max_force")
 
@@ -182,9 +182,6 @@ class InPalmRotate(terms.HandTask[InPalmRotateSpec]):
     def score(self) -> Float[Tensor, " env"]:
         """Return how many quarter turns were reached."""
         return self.reached
-
-    def _distance(self, now: Now) -> Float[Tensor, " env"]:
-        return vector_norm(now.object.pos - self.start_pos, dim=1)
 
     def _goal_quat(self) -> rotations.Quat:
         return rotations.product(rotations.about(self.axis, self._goal()), self.start_quat)
