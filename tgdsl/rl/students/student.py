@@ -21,6 +21,7 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
+from rsl_rl.modules import MLP
 from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
 
@@ -59,15 +60,6 @@ class Encoder:
     grid: Grid | None = None
 
 
-def mlp(size: int, hidden: tuple[int, ...], output: int) -> nn.Sequential:
-    """Return linear layers with ELU between them."""
-    layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(size, width), nn.ELU()]
-        size = width
-    return nn.Sequential(*layers, nn.Linear(size, output))
-
-
 def network(size: int, encoder: Encoder) -> Embedding:
     """Return the network that embeds a group of some size."""
     return {"mlp": Mlp, "lstm": Lstm, "cnn": Convolution, "convrnn": RecurrentConvolution}[encoder.kind](size, encoder)
@@ -80,11 +72,11 @@ class Embedding(nn.Module):
 
 
 class Mlp(Embedding):
-    """Linear layers."""
+    """Linear layers with ELU between them."""
 
     def __init__(self, size: int, encoder: Encoder):
         super().__init__()
-        self.layers = mlp(size, encoder.hidden, encoder.size)
+        self.layers = MLP(size, encoder.size, encoder.hidden)
 
     def forward(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         return self.layers(x), memory
@@ -219,8 +211,8 @@ class Student(nn.Module):
         encoders = [network(size, encoder) for size, encoder in architecture.groups]
         self.encoders, self.memory = nn.ModuleList(encoders), sum(encoder.memory for encoder in encoders)
         latent = sum(encoder.size for _, encoder in architecture.groups)
-        self.trunk = mlp(latent, architecture.hidden, architecture.actions)
-        self.decoders = nn.ModuleList([mlp(latent, hidden, 1) for hidden in architecture.heads])
+        self.trunk = MLP(latent, architecture.actions, architecture.hidden)
+        self.decoders = nn.ModuleList([MLP(latent, 1, hidden) for hidden in architecture.heads])
         self.gates = Gates(architecture.gates[1]) if architecture.gates else None
 
     def forward(self, x: Tensor, memory: Tensor, noise: Tensor | None = None) -> StudentOutput:
