@@ -69,7 +69,7 @@ class Draws:
         return dict(zip(sizes, self.side_by_side(sizes, counter, chosen).split(list(sizes.values()), dim=1), strict=True))
 
     def side_by_side(
-        self, sizes: Mapping[str, int], counter: Int[Tensor, " env"], chosen: Bool[Tensor, " env"] | None = None
+        self, sizes: Mapping[str, int], counter: Int[Tensor, " env"], chosen: Bool[Tensor, " env"] | None
     ) -> Float[Tensor, "env num"]:
         """Return numbers between 0 and 1 for several purposes, concatenated, with as few operations as for one."""
         streams = self._streams(sizes)

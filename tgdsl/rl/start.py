@@ -83,7 +83,7 @@ def make_simulation(
 
 
 def make_setup(
-    loaded: LoadedTask, sensors: TaskSensors, sim: Simulation, joints: tuple[str, ...], draws: Draws, first_env: int = 0
+    loaded: LoadedTask, sensors: TaskSensors, sim: Simulation, joints: tuple[str, ...], draws: Draws, first_env: int
 ) -> Setup:
     """Return the setup of a task without grasps."""
     try:

@@ -244,7 +244,7 @@ class _Place:
         sim.qvel[:, self._qvel] = 0.0
 
 
-def with_grasps(setup: Setup, loaded: LoadedTask, sim: Simulation, scene: SceneFile, progress: Progress | None = None) -> Setup:
+def with_grasps(setup: Setup, loaded: LoadedTask, sim: Simulation, scene: SceneFile, progress: Progress | None) -> Setup:
     """Return a setup with the grasps of its document, if it has any; reset the simulation afterwards."""
     spec, tell = grasp_spec(loaded.spec), progress or silent
     if spec is None:

@@ -79,7 +79,7 @@ def evaluate(env: TouchEnv, actor: Actor, episodes: int = 1000, seed: int = SEED
 
 
 def evaluate_each(
-    env: TouchEnv, actor: Actor, blocks: int, episodes: int = 1000, seed: int = SEED, progress: Progress = silent
+    env: TouchEnv, actor: Actor, blocks: int, episodes: int, seed: int = SEED, progress: Progress = silent
 ) -> list[Evaluation]:
     """Let an actor act, and return how good that was in each block of environments.
 

@@ -109,7 +109,7 @@ def _cell(value: float | None, dimension: str | Dimension) -> str:
 class GaitMeter:
     """Adds up how policies move objects, each in a block of environments."""
 
-    def __init__(self, env: TouchEnv, blocks: int = 1):
+    def __init__(self, env: TouchEnv, blocks: int):
         setup, num, device = env.task.setup, env.num_envs, env.sim.qpos.device
         self._env, self._blocks, actuators = env, blocks, setup.actuators
         self._links, self._joints = setup.links, actuators.names

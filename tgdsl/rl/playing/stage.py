@@ -35,7 +35,7 @@ class TaskStage(SimStage):
 
     by_hand: bool | None = False
 
-    def __init__(self, env: TouchEnv, actor: Actor, seed: int = 0):
+    def __init__(self, env: TouchEnv, actor: Actor, seed: int):
         super().__init__(env.touch, env.sim)
         self.env, self._seed, self.groups = env, seed, tuple(env.groups)
         self._actor, self._features = _ByHand(actor, self), env.describe()

@@ -54,8 +54,8 @@ def action_error(
     action: Actions,
     label: Actions,
     before: Actions,
-    std: Float[Tensor, " joint"] | None = None,
-    clip: float | None = None,
+    std: Float[Tensor, " joint"] | None,
+    clip: float | None,
     *,
     is_huber: bool = False,
 ) -> Float[Tensor, " student"]:
