@@ -40,7 +40,7 @@ class EnvFaults:
     restarted: Bool[Tensor, " env"]  # environments that the last step has restarted
     _held: Bool[Tensor, "kind env"]
 
-    def __init__(self, num_envs: int, device: torch.device, on_fault: str = "raise"):
+    def __init__(self, num_envs: int, device: torch.device, on_fault: str):
         if on_fault not in get_args(OnFault):
             hint = did_you_mean(on_fault, get_args(OnFault), "choices")
             raise SimulationError(f'on_fault is "{on_fault}"; {hint}')

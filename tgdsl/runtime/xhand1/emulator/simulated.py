@@ -178,9 +178,9 @@ class EmulatedSource(XHand1Source):
         *,
         control_step: float,
         calibration: Calibration,
-        motion: MotionLimits | None = None,
-        timing: SerialTiming | None = None,
-        lockstep: bool = False,
+        motion: MotionLimits | None,
+        timing: SerialTiming | None,
+        lockstep: bool,
     ):
         """Plug the hand in and open it; in lockstep the simulation makes a control step when stepped, else it runs in time."""
         self.body, self._is_lockstep, self._has_warned = body, lockstep, False

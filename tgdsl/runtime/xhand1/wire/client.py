@@ -75,7 +75,7 @@ def list_ports() -> tuple[PortInfo, ...]:
 class SerialPort:
     """A serial port of this process alone: 8 data bits, no parity, 1 stop bit, no flow control."""
 
-    def __init__(self, device: str, baud: int = BAUD):
+    def __init__(self, device: str, baud: int):
         """Open it by its name, such as `/dev/ttyUSB0`; one of `/dev/serial/by-id` stays the same when others are plugged in."""
         self._device = device
         self._errors = (_pyserial().SerialException, OSError)

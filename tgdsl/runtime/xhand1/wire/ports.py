@@ -28,10 +28,9 @@ class FoundHand(NamedTuple):
 
 
 def find_hands(
-    device: str, hand_ids: Iterable[int] = range(8), *, timing: SerialTiming | None = None, open_port: _OpenPort = SerialPort
+    device: str, hand_ids: Iterable[int], *, timing: SerialTiming, open_port: _OpenPort = SerialPort
 ) -> tuple[FoundHand, ...]:
     """Request the version of each id on a port and return the hands that answer."""
-    timing = timing or SerialTiming()
     client = SerialClient(open_port(device, timing.baud), None, timing)
     results = []
     try:
@@ -58,7 +57,7 @@ class AskedPort(NamedTuple):
         return name + (f": {self.trouble}" if self.trouble else "" if self.hands else ": no hand answers")
 
 
-def ask_ports(device: str | None = None, hand_id: int | None = None) -> tuple[AskedPort, ...]:
+def ask_ports(device: str | None, hand_id: int | None) -> tuple[AskedPort, ...]:
     """Ask all serial ports, or one, for all hands, or one: a version request per id, which holds no set-point."""
     ids, timing = (range(8), _PATIENT) if hand_id is None else ((hand_id,), _MORE_PATIENT)
     ports = {port.device: port for port in list_ports()}
