@@ -48,6 +48,14 @@ def moved_joints(loaded: LoadedTask, sensors: TaskSensors) -> tuple[str, ...]:
     return tuple(name for name in joint_names if any(matching(pattern, [name]) for pattern in loaded.spec.joints))
 
 
+def moved_actuators(loaded: LoadedTask, model: mujoco.MjModel, joints: tuple[str, ...]) -> Actuators:
+    """Return the actuators of the joints that the policy moves."""
+    try:
+        return Actuators.of(model, joints)
+    except SimulationError as error:
+        raise loaded.error(("joints",), str(error)) from error
+
+
 def make_simulation(
     loaded: LoadedTask,
     sensors: TaskSensors,
@@ -86,10 +94,7 @@ def make_setup(
     loaded: LoadedTask, sensors: TaskSensors, sim: Simulation, joints: tuple[str, ...], draws: Draws, first_env: int
 ) -> Setup:
     """Return the setup of a task without grasps."""
-    try:
-        actuators = Actuators.of(sim.model, joints)
-    except SimulationError as error:
-        raise loaded.error(("joints",), str(error)) from error
+    actuators = moved_actuators(loaded, sim.model, joints)
     num_variants = sensors.num_variants(loaded.spec.object)
     friction, mass = (get(sensors.object).to(sim.qpos).clone() for get in (sim.properties.friction, sim.properties.mass))
     keyframe = sim.qpos[0].double().cpu().numpy()

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.console.progress import Progress
-from tgdsl.errors import LowerError, SimulationError, TgdslError, listed
+from tgdsl.errors import LowerError, TgdslError, listed
 from tgdsl.rl import groups
 from tgdsl.rl.actuation import Actuation, Actuators, DriveSpec
 from tgdsl.rl.draws import Draws
@@ -40,7 +40,7 @@ from tgdsl.rl.playing.policy import (
 )
 from tgdsl.rl.sensors import GROUP, PolicyTouch, TaskSensors, compile_sensors
 from tgdsl.rl.spec import ProprioSpec
-from tgdsl.rl.start import moved_joints
+from tgdsl.rl.start import moved_actuators, moved_joints
 from tgdsl.rl.task import HandNow
 from tgdsl.runtime.connection import Connection
 from tgdsl.runtime.stepped_scene import SteppedScene
@@ -132,10 +132,7 @@ def prepare(
     if card is not None:
         check_card(saved, moved, sensors.touch)
         changes += changes_around(card, loaded, model)
-    try:
-        actuators = Actuators.of(model, moved)
-    except SimulationError as error:
-        raise loaded.error(("joints",), str(error)) from error
+    actuators = moved_actuators(loaded, model, moved)
     sizes = {name: int(card["groups"][name]) if card and name in card["groups"] else len(goal) for name in names}
     if "proprio" in sizes:
         sizes["proprio"] = 3 * len(moved)

@@ -33,18 +33,16 @@ from tgdsl.errors import SimulationError
 from tgdsl.files.cache import cached
 from tgdsl.plan.scene import SceneFile
 from tgdsl.rl import rotations
-from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.grasps.grasps import Grasps, GraspSpec, GraspTable, cache_key, grasp_spec, read_grasps, settings_of
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.sensors import TaskSensors, compile_sensors
-from tgdsl.rl.start import make_simulation, moved_joints
+from tgdsl.rl.start import make_simulation, moved_actuators, moved_joints
 from tgdsl.rl.task import Setup
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.scene.scene import scene_digest
-from tgdsl.schema.yaml import Path
 
 SIDE_BY_SIDE = 256  # most parallel trials; for few grasps twice their number
 PUSHES = 4  # pushes of each trial
@@ -96,13 +94,11 @@ class _Trials:
         assert isinstance(sim, BatchSimulation)
         self.sim, model = sim, sim.model
         self.variant: Int[Tensor, " env"] = torch.arange(num_envs) % self.num_variants
+        actuators = moved_actuators(loaded, model, self.joints)
         try:
-            place: Path = ("joints",)
-            actuators = Actuators.of(model, self.joints)
-            place = ("grasps", "closed")
             closed = keyframe_id(model, spec.closed)
         except SimulationError as error:
-            raise loaded.error(place, str(error)) from error
+            raise loaded.error(("grasps", "closed"), str(error)) from error
         self._actuator, self._joint = torch.from_numpy(actuators.actuator), torch.from_numpy(actuators.qpos)
         self._low, self._high = torch.from_numpy(actuators.low), torch.from_numpy(actuators.high)
         self._spread = (SHARE * (self._high - self._low)).clamp(max=spec.spread)
