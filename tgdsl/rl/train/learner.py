@@ -207,8 +207,8 @@ class Learning(Actor):
         """Return the learner's numbers of the iteration, on the device; a score without episodes is NaN."""
 
 
-PROPRIO, PRIVILEGED, STATE, PROPS = "proprio", "priv_proprio", "priv_obj_state", "priv_obj_props"
-"""Groups of the hand's joints; of joints and forces; of the object's motion; of its properties."""
+PROPRIO, STATE, PROPS = "proprio", "priv_obj_state", "priv_obj_props"
+"""Groups of the hand's joints; of the object's motion; of its properties."""
 MOST_STD = 1e6  # bound above of the actions' standard deviation: rsl_rl's
 CRITIC_FIRST = 25  # iterations in which only the critic learns, after a start from a policy
 STD = "distribution.std_param"  # name of the actions' deviations among an actor's weights

@@ -158,7 +158,6 @@ class EncodedModel(MLPModel):
 class Exported(nn.Module):
     """A copy of a model that takes concatenated groups, (env, feature), and returns actions without exploration."""
 
-    is_recurrent = False
     input_names = ("obs",)
     output_names = ("actions",)
 
