@@ -6,7 +6,6 @@ Shapes: `actuator` actuators of the scene, `joint` joints by name.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -32,11 +31,10 @@ class SteppedScene:
 
     num_envs = 1
 
-    def __init__(self, touch: TactileModule, sim: Any):
+    def __init__(self, touch: TactileModule, sim: Simulation):
         if sim.num_envs != 1:
             raise SimulationError(f"an emulated hand has one environment, found {sim.num_envs}")
-        self.sim: Simulation = sim
-        self._touch = touch
+        self.sim, self._touch = sim, touch
         self.readings = self.read()
 
     @property
