@@ -236,7 +236,7 @@ def test_opposed_forces_do_not_hide_the_load(tmp_path):
 GRIPPER = """
 <mujoco>
   <worldbody>
-    <body name="base" pos="0 0 .3" quat="0 1 0 0">
+    <body name="base" pos="0 0 .3" euler="180 0 0">
       <geom type="cylinder" size=".01 .02"/>
       <body name="left" pos=".03 0 .05"><joint type="slide" axis="1 0 0"/><geom type="box" size=".006 .01 .03"/></body>
       <body name="right" pos="-.03 0 .05"><joint type="slide" axis="1 0 0"/><geom type="box" size=".006 .01 .03"/></body>
@@ -247,8 +247,10 @@ GRIPPER = """
 """
 
 
-def test_a_hanging_gripper_is_upright_and_shows_a_pad(tmp_path):
-    (tmp_path / "gripper.xml").write_text(GRIPPER)
+@pytest.mark.parametrize("tilt", [0, 30])
+def test_a_hanging_gripper_is_upright_and_shows_a_pad(tmp_path, tilt):
+    """Its pads face each other along x, or along a line that is tilted about y; elevation counts from the horizon."""
+    (tmp_path / "gripper.xml").write_text(GRIPPER.replace('"180 0 0"', f'"180 {tilt} 0"'))
     grid = {"method": "grid", "rows": 4, "columns": 3, "radius": 0.004}
     links = {"left": {**grid, "direction": [1, 0, 0]}, "right": {**grid, "direction": [-1, 0, 0]}}
     touch = tgdsl.compile(
@@ -267,7 +269,8 @@ def test_a_hanging_gripper_is_upright_and_shows_a_pad(tmp_path):
         camera_of("front", sim.model, [touch.plan.layout], pose, base),
         best_camera(markers, hand, sim.model, touch.plan.layout, pose, base),
     ):
-        assert camera.up[2] > 0.8
+        assert camera.toward[2] == pytest.approx(np.sin(np.radians(VIEWS["front"][1])))
+        assert camera.up[2] == pytest.approx(np.cos(np.radians(VIEWS["front"][1])))
         assert 0.4 < abs(camera.toward[0]) < 0.8  # along the normals; 0 would be edge-on
         assert num_in_view(sim, markers, camera) == 12  # all of one pad
 

@@ -80,9 +80,16 @@ def test_side_box_and_resolution_move_the_taxels(tmp_path):
         assert discs(page)["left_tip"] == 24
         page.side.value = ALL_AROUND
         page.react()
-        assert "box" in next(
-            line for line in layout_text(page.draft.proposal, "").splitlines() if line.startswith("    left_tip")
-        )
+
+        def text_of_tip() -> str:
+            lines = layout_text(page.draft.proposal, "").splitlines()
+            return next(line for line in lines if line.startswith("    left_tip"))
+
+        assert "box" in text_of_tip()
+        slider, lowest, highest = page._bounds[2]
+        slider.value = (lowest, highest)
+        page.react()
+        assert "box" not in text_of_tip()
 
 
 def test_links_can_leave_and_join_groups(tmp_path):
