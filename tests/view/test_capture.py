@@ -72,7 +72,7 @@ def test_a_video_ends_when_it_is_stopped():
 
 
 def test_buttons_act_for_the_browser_that_clicked(document, monkeypatch):
-    clicks, client = {}, Client(num_frames=3)
+    clicks, labels, client = {}, [], Client(num_frames=3)
     for kind in (viser.GuiButtonHandle, viser.GuiButtonGroupHandle):
         monkeypatch.setattr(kind, "on_click", lambda handle, act: clicks.update({handle.label: act}))
     stage = SceneStage(tgdsl.compile(document))
@@ -82,6 +82,8 @@ def test_buttons_act_for_the_browser_that_clicked(document, monkeypatch):
         clicks[label](SimpleNamespace(client=client, target=SimpleNamespace(value=value)))
         page.run(seconds=0.01)
 
+    render = client.get_render
+    client.get_render = lambda *size, **options: (labels.append(page.panel.record.label), render(*size, **options))[1]
     click("time", "step once")
     assert page.panel.paused.value and stage.time == pytest.approx(stage.control_step)
     click("save last minute")
@@ -89,6 +91,8 @@ def test_buttons_act_for_the_browser_that_clicked(document, monkeypatch):
     assert stage.time == 0
     click("screenshot")
     click("video")
+    assert labels == ["record video", *["stop and save video"] * 3]
+    assert page.panel.record.label == "record video"
     page.close()
     stage.close()
     files = dict(client.files)

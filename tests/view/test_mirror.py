@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import signal
 import socket
 import threading
 import time
@@ -113,12 +114,18 @@ def test_a_loops_page_shows_its_frames_and_ends_with_its_process(document, capsy
     sim = tgdsl.simulate(touch, num_envs=1)
     page = tgdsl.show(touch, sim, port=8360)
     assert capsys.readouterr().out == f"tgdsl view: {page.url}\n"
-    begin = time.monotonic()
-    with silent_browser(page.url):
-        while page.num_frames < 2 and time.monotonic() < begin + 60:
+
+    def sends(num: int) -> bool:
+        begin, wanted = time.monotonic(), page.num_frames + num
+        while page.num_frames < wanted and page._process.poll() is None and time.monotonic() < begin + 60:
             page.update(touch(sim.state()))
             time.sleep(0.01)
-    assert page.num_frames >= 2
+        return page.num_frames >= wanted
+
+    with silent_browser(page.url):
+        assert sends(2)
+        page._process.send_signal(signal.SIGINT)  # as Ctrl-C does, for both processes of a terminal
+        assert sends(10)
     page.close()
     assert page._process.returncode is not None
     assert page._process.stdin.closed and page._process.stdout.closed

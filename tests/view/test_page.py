@@ -198,13 +198,17 @@ def test_a_file_that_is_not_a_run_is_refused_with_the_missing_array(tmp_path):
         View(tmp_path / "log.npz")._stage()
 
 
-def test_another_stage_replaces_the_discs(document):
-    touch = tgdsl.compile(document)
-    with opened(SceneStage(touch)) as page:
-        first = disc_of(page)
-        page.show(SceneStage(touch))
+def test_another_stage_replaces_the_discs_and_all_bodies(document, tmp_path):
+    lamp = '<body name="lamp" pos="0 0 .5"><geom type="box" size=".02 .02 .005"/></body>'
+    (tmp_path / "press.xml").write_text(SCENE.replace("</worldbody>", f"{lamp}</worldbody>"))
+    (tmp_path / "press.yaml").write_text(WITHOUT_PROXIMITY)
+    with opened(SceneStage(tgdsl.compile(tmp_path / "press.yaml"))) as page:
+        first, ((mesh, _),) = disc_of(page), page.scene._meshes[page.stage.model.body("lamp").id]
+        page.show(SceneStage(tgdsl.compile(document)))
         assert disc_of(page) is not first
         assert len(disc_of(page).batched_positions) == len(first.batched_positions)
+        with pytest.warns(UserWarning, match="already removed"):
+            mesh.remove()
 
 
 def test_a_stage_with_nothing_to_draw_keeps_the_previous_one_and_shows_a_problem(document):
