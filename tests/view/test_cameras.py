@@ -247,32 +247,52 @@ GRIPPER = """
 """
 
 
-@pytest.mark.parametrize("tilt", [0, 30])
-def test_a_hanging_gripper_is_upright_and_shows_a_pad(tmp_path, tilt):
-    """Its pads face each other along x, or along a line that is tilted about y; elevation counts from the horizon."""
-    (tmp_path / "gripper.xml").write_text(GRIPPER.replace('"180 0 0"', f'"180 {tilt} 0"'))
+def gripper(folder: Path, left_direction: int, tilt: float = 0.0) -> tuple[tgdsl.TactileModule, BatchSimulation]:
+    """Return a gripper, tilted about y [degrees], whose taxels lie in opposite directions along x."""
+    (folder / "gripper.xml").write_text(GRIPPER.replace('"180 0 0"', f'"180 {tilt} 0"'))
     grid = {"method": "grid", "rows": 4, "columns": 3, "radius": 0.004}
-    links = {"left": {**grid, "direction": [1, 0, 0]}, "right": {**grid, "direction": [-1, 0, 0]}}
+    links = {
+        "left": {**grid, "direction": [left_direction, 0, 0]},
+        "right": {**grid, "direction": [-left_direction, 0, 0]},
+    }
     touch = tgdsl.compile(
         {
             "tgdsl": 1,
-            "robot": {"model": str(tmp_path / "gripper.xml"), "layout": {"resolutions": {"o": links}}},
+            "robot": {"model": str(folder / "gripper.xml"), "layout": {"resolutions": {"o": links}}},
             "objects": {"ball": {"body": "ball"}},
             "sensors": {"touch": {**SENSOR, "links": "*", "feels": ["ball"]}},
         }
     )
-    sim = tgdsl.simulate(touch, 1)
+    return touch, tgdsl.simulate(touch, 1)
+
+
+def best_camera_of_gripper(touch, sim, force: torch.Tensor) -> tuple[Markers, Camera]:
+    """Return the taxels that read forces, and the chosen camera."""
     pose, base = Pose(*sim.body_poses(0)), sim.model.body("base").id
-    markers = markers_of(touch, sim, touch.outputs[0], torch.ones(1, 24, 3), 0)
+    markers = markers_of(touch, sim, touch.outputs[0], force, 0)
     hand = mesh_of(sim.model, pose, {sim.model.body(name).id for name in ("base", "left", "right")})
-    for camera in (
-        camera_of("front", sim.model, [touch.plan.layout], pose, base),
-        best_camera(markers, hand, sim.model, touch.plan.layout, pose, base),
-    ):
+    return markers, best_camera(markers, hand, sim.model, touch.plan.layout, pose, base)
+
+
+@pytest.mark.parametrize("tilt", [0, 30])
+def test_a_hanging_gripper_is_upright_and_shows_a_pad(tmp_path, tilt):
+    """Its pads face each other; elevation counts from the horizon."""
+    touch, sim = gripper(tmp_path, 1, tilt)
+    markers, best = best_camera_of_gripper(touch, sim, torch.ones(1, 24, 3))
+    for camera in (camera_of("front", sim.model, [touch.plan.layout], Pose(*sim.body_poses(0)), 1), best):
         assert camera.toward[2] == pytest.approx(np.sin(np.radians(VIEWS["front"][1])))
         assert camera.up[2] == pytest.approx(np.cos(np.radians(VIEWS["front"][1])))
         assert 0.4 < abs(camera.toward[0]) < 0.8  # along the normals; 0 would be edge-on
         assert num_in_view(sim, markers, camera) == 12  # all of one pad
+
+
+@pytest.mark.parametrize("pad", ["left", "right"])
+def test_the_one_pad_that_is_touched_is_faced(tmp_path, pad):
+    """The pads look away from each other, so none hides the other."""
+    touch, sim = gripper(tmp_path, -1)
+    is_touched = torch.from_numpy(touch.taxels["touch"]["link"] == pad)
+    markers, camera = best_camera_of_gripper(touch, sim, is_touched[None, :, None] * torch.ones(3))
+    assert (markers.normal[is_touched.numpy()] @ camera.toward).min() > 0.85
 
 
 @pytest.mark.slow

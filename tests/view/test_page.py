@@ -474,7 +474,7 @@ def test_a_heat_map_has_its_distal_end_up_and_scattered_taxels_as_dots(document)
     image = maps.image(colour)
     assert set(np.unique(image[image[..., 1] == 7][:, 0])) == set(colour[:, 0])
 
-    def middle(taxel: int) -> np.ndarray:
+    def middle(taxel: int, image: np.ndarray = image) -> np.ndarray:
         return np.argwhere((image == colour[taxel]).all(axis=-1)).mean(axis=0)
 
     cells = {(int(row), int(column)): i for i, (row, column) in enumerate(zip(table["row"], table["column"], strict=True))}
@@ -486,6 +486,9 @@ def test_a_heat_map_has_its_distal_end_up_and_scattered_taxels_as_dots(document)
     scattered["row"] = scattered["column"] = -1
     dots = HeatMaps(scene_model(touch.plan.scene), scattered).image(colour)
     assert set(np.unique(dots[dots[..., 1] == 7][:, 0])) == set(colour[:, 0])
+    widths = [2 * np.sqrt((dots == each).all(axis=-1).sum() / np.pi) for each in colour]
+    apart = np.linalg.norm(middle(cells[0, 1], dots) - middle(cells[0, 0], dots))
+    np.testing.assert_allclose(widths, apart, rtol=0.03)  # dots of whole pixels touch their neighbours
 
 
 def test_the_heat_map_has_the_readings_colours(document):
