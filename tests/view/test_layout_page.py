@@ -61,10 +61,13 @@ def test_discs_are_polygons_of_16_corners(tmp_path):
     np.testing.assert_allclose(normals[:, 2], np.sin(2 * np.pi / 16), atol=1e-6)  # twice the area of each of 16 triangles
 
 
-def test_side_box_and_resolution_move_the_taxels(tmp_path):
+def test_side_box_and_resolution_move_the_taxels(tmp_path, clicks):
     with opened(tmp_path) as page:
-        page._choose("left_tip")
-        page.react()
+        tip = page.draft.robot.compiled.body("left_tip").id
+        for node, chosen in (("taxels", "left_tip"), ("mesh0", "(all)"), ("mesh0", "left_tip")):
+            clicks[f"/body{tip}/{node}"](None)
+            page.react()
+            assert page.chosen.value == chosen
         assert page.side.value == "+x" and page._frames["left_tip"].show_axes
         page.side.value = "-y"
         page.react()
@@ -107,7 +110,7 @@ def test_links_can_leave_and_join_groups(tmp_path):
         assert page.side.value == "+z"
 
 
-def test_an_invalid_value_is_shown_and_blocks_writing(tmp_path):
+def test_an_invalid_value_is_shown_and_blocks_writing(tmp_path, clicks):
     with opened(tmp_path) as page:
         num = sum(discs(page).values())
         page.density.value = 0.0
@@ -119,7 +122,8 @@ def test_an_invalid_value_is_shown_and_blocks_writing(tmp_path):
         page.density.value = 4.0
         page.react()
         assert page.problem.content == ""
-        page._write()
+        clicks["write layout.yaml"](None)
+        page.react()
         assert page.out.exists()
 
 

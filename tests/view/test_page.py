@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -388,7 +389,7 @@ def test_links_groups_and_sensors_can_be_switched_on_and_off(tmp_path):
         assert {mesh.visible for body in page.scene.robot for mesh, _ in page.scene._meshes[body]} == {False}
 
 
-def test_a_chosen_link_is_plotted_and_a_picked_taxel_named(document):
+def test_a_chosen_link_is_plotted_and_a_clicked_taxel_named(document, clicks):
     with opened(SceneStage(tgdsl.compile(document))) as page:
         for _ in range(100):
             page.stage.advance()
@@ -399,11 +400,17 @@ def test_a_chosen_link_is_plotted_and_a_picked_taxel_named(document):
         assert "sum of pad" in page.panel.value.content
         assert page._history[-1][1] == pytest.approx(float(force.sum()), rel=1e-3)
         hottest = int(force.argmax())
-        page._pick(hottest)
+        clicks[disc_of(page).name](SimpleNamespace(instance_index=hottest))
+        page._react()
         page.draw()
+        assert page.scene._name.visible and page.panel.plotted.value == "(all)"
         assert page.scene._name.text == f"pad, taxel {hottest}: {float(force[hottest]):.4g} N"
         position = ", ".join(f"{1e3 * x:.1f}" for x in page.stage.touch.taxels["touch"]["pos"][hottest])
         assert f"({position}) mm" in page.panel.value.content
+        clicks[disc_of(page).name](SimpleNamespace(instance_index=hottest))
+        page._react()
+        page.draw()
+        assert not page.scene._name.visible and page.panel.value.content.startswith("**sum**")
 
 
 def test_objects_have_the_colours_of_their_materials():
@@ -437,7 +444,7 @@ def test_another_environment_shows_its_own_object(document):
         np.testing.assert_allclose(half_widths(), 0.02, atol=1e-3)
 
 
-def test_temperatures_colour_the_surfaces_of_links(document):
+def test_temperatures_colour_the_surfaces_of_links(document, clicks):
     warm = document.with_name("warm.yaml")
     objects = "{body: ball, material: aluminium, temperature: 60 degC}"
     sensors = (
@@ -462,6 +469,12 @@ def test_temperatures_colour_the_surfaces_of_links(document):
         assert area == pytest.approx(2 * (0.06**2 + 2 * 0.06 * 0.01), rel=1e-4)
         page._react()
         assert {mesh.visible for mesh, _ in page.scene._meshes[page.stage.model.body("pad").id]} == {False}
+        drawn = next(mesh for mesh, _, row in layer.members if (layer.rows.pos[row] == warmest).all())
+        clicks[drawn.name](None)
+        page._react()
+        page.draw()
+        assert page.panel.value.content.startswith(f"**pad, cell {values.argmax()}** at ")
+        assert f"{values.max():.4g} °C" in page.panel.value.content
 
 
 def test_a_heat_map_has_its_distal_end_up_and_scattered_taxels_as_dots(document):
