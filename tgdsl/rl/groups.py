@@ -21,6 +21,7 @@ from tgdsl.rl.rotations import Quat, between, inverse, product, six_numbers
 from tgdsl.rl.spec import ProprioSpec
 from tgdsl.rl.task import Features, HandNow, Now, Part, Setup
 from tgdsl.runtime.xhand1.source import TIME_CONSTANT_S
+from tgdsl.tensors.env_ids import put_rows
 
 GoalPart = Literal["orientation", "difference", "angle"]  # parts of an observed goal, an orientation
 
@@ -41,8 +42,8 @@ class MeasuredVelocity:
 
     def begin(self, chosen: Bool[Tensor, " env"], joint_pos: Float[Tensor, "env joint"]) -> None:
         """Begin again at rest in some environments."""
-        self.value.masked_fill_(chosen[:, None], 0.0)
-        self._before.copy_(torch.where(chosen[:, None], joint_pos, self._before))
+        put_rows(self.value, chosen, 0.0)
+        put_rows(self._before, chosen, joint_pos)
 
 
 def proprio(now: Now | HandNow, vel_scale: float = 1.0) -> Float[Tensor, "env feature"]:

@@ -28,6 +28,7 @@ from tgdsl.schema.select import matching
 from tgdsl.schema.yaml import SET
 from tgdsl.schema.yaml import Path as Place
 from tgdsl.sensors.known import known_kinds
+from tgdsl.tensors.env_ids import put_rows
 from tgdsl.tuning.compile import compile as compile_document
 
 GROUP = "tactile_sensors"  # the observation group of a policy's touch
@@ -349,7 +350,7 @@ class SubstepTouch:
             start = value[:, None].expand(-1, self._sim.substeps, -1)
             if name not in self.stacks:
                 self.stacks[name] = start.clone()
-            self.stacks[name].copy_(torch.where(chosen[:, None, None], start, self.stacks[name]))
+            put_rows(self.stacks[name], chosen, start)
 
     def observe(self) -> dict[str, Float[Tensor, "env feature"]]:
         """Return copies of the groups: all features of the first physics step, then of the second."""

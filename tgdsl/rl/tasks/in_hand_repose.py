@@ -51,7 +51,7 @@ from tgdsl.rl.students.spec import DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, reward_term
 from tgdsl.rl.tasks.parts import PlacedTaskSpec, ProgressSpec
 from tgdsl.rl.train.spec import TrainSpec
-from tgdsl.tensors.env_ids import may_be_nonempty
+from tgdsl.tensors.env_ids import may_be_nonempty, put_rows
 
 
 class Train(with_defaults(TrainSpec, iterations=20000)):
@@ -188,7 +188,7 @@ class InHandRepose(terms.HandTask[InHandReposeSpec]):
             count.masked_fill_(self.is_reached, 0)
         self.left.copy_(error)
         if may_be_nonempty(self.is_reached):
-            self.goal.copy_(torch.where(self.is_reached[:, None], self._goal_after(self.goal), self.goal))
+            put_rows(self.goal, self.is_reached, self._goal_after(self.goal))
             self.left.copy_(rotations.between(self.goal, quat))
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:

@@ -50,6 +50,7 @@ from tgdsl.rl.task import Now, Setup, Start, reward_term
 from tgdsl.rl.tasks.parts import Holding, HoldSpec, ProgressSpec
 from tgdsl.rl.train.spec import TrainSpec
 from tgdsl.runtime.simulators.watch import Watch
+from tgdsl.tensors.env_ids import put_rows
 
 UPRIGHT = math.radians(20.0)  # tilt below which a turn counts for the score [rad]; ours
 
@@ -206,7 +207,7 @@ class Screwdriver(terms.HandTask[ScrewdriverSpec]):
         if self.spec.stall:
             self.angle += step
             is_further = self.angle >= self.mark + self.spec.stall.turn
-            self.mark.copy_(torch.where(is_further, self.angle, self.mark))
+            put_rows(self.mark, is_further, self.angle)
             self.since.copy_(torch.where(is_further, 0, self.since + 1))
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:

@@ -27,7 +27,7 @@ from tgdsl.runtime.simulators.objects import (
 )
 from tgdsl.runtime.warp.stream import libraries
 from tgdsl.scene.scene import Choice, SceneModels, is_absent
-from tgdsl.tensors.env_ids import broadcast_over
+from tgdsl.tensors.env_ids import broadcast_over, put_rows
 
 Array = np.ndarray
 Row = dict[str, Array]
@@ -82,7 +82,7 @@ class WorldObjects:
             target = parameters[name] if name in OBJECT_FIELDS else arrays[name]
             rows = torch.from_numpy(np.stack([self._rows[key][name] for key in distinct]))
             new = rows.to(target.device, target.dtype)[index].reshape(target.shape)
-            target.copy_(torch.where(broadcast_over(changed, new), new, target))
+            put_rows(target, changed, new)
 
     def env_model(self, env: int) -> mujoco.MjModel:
         """Return the model of one environment."""
