@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tgdsl.errors import TgdslError, did_you_mean, listed
+from tgdsl.files.arrays import read_arrays
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.module.taxels import Columns
@@ -165,8 +166,7 @@ def of_run(
 
     A recording has positions and readings after each step: a frame's action is the next step's.
     """
-    with np.load(file, allow_pickle=False) as archive:
-        arrays = {name: archive[name] for name in archive.files}
+    arrays = read_arrays(file, "a recording of tgdsl run")
     recorded = [output for output in touch.outputs if output.name in arrays]
     output = _force_of(recorded, reading)
     columns = [list(arrays[f"{output.name}:channels"]).index(name) for name in FORCE]

@@ -6,7 +6,6 @@ Shapes: `grasp` grasps, `nq` and `nu` as in MuJoCo's model.
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError, listed
 from tgdsl.fields.models import Angle, PositiveLength, Quantity, Range, RangeOf, SpecModel
+from tgdsl.files.arrays import read_arrays
 from tgdsl.files.cache import digest
 from tgdsl.files.write import atomic_open, with_folder
 from tgdsl.rl.actuation import ZERO
@@ -133,13 +133,11 @@ def write_grasps(grasps: Grasps, file: Path) -> None:
 
 def read_grasps(file: Path, scene: str, object: str) -> Grasps:
     """Read grasps of an object in a scene from a file."""
+    arrays = read_arrays(file, expected := "a file that `tgdsl grasps --out` wrote", SimulationError)
     try:
-        with file.open("rb") as raw, np.load(raw, allow_pickle=False) as archive:
-            grasps = Grasps.unpacked(archive)
-    except OSError as error:
-        raise SimulationError(f"{file}: cannot read this file: {error.strerror or error}") from error
-    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise SimulationError(f"{file}: no grasps, expected a file that `tgdsl grasps --out` wrote: {error}") from error
+        grasps = Grasps.unpacked(arrays)
+    except (ValueError, KeyError) as error:
+        raise SimulationError(f"{file}: expected {expected}: {error}") from error
     if grasps.object != object:
         raise SimulationError(f'{file}: grasps of the object "{grasps.object}", expected "{object}"')
     if grasps.scene != scene:
