@@ -44,9 +44,10 @@ from jaxtyping import Bool, Float, Int
 from pydantic import Discriminator, Tag, model_validator
 from torch import Tensor
 
-from tgdsl.errors import SimulationError, did_you_mean, listed
+from tgdsl.errors import SimulationError, listed
 from tgdsl.fields.models import NonNegative, PositiveLength, Quantity, Range, RangeOf, SpecModel
 from tgdsl.rl.draws import Draws, within
+from tgdsl.runtime.simulators.model_ids import element_id
 from tgdsl.tensors.env_ids import put
 
 BREAKAWAY_SPEED = 0.05  # below this a joint counts as at rest, where its drive has to break away [rad/s]
@@ -150,18 +151,13 @@ class Actuators:
     @classmethod
     def of(cls, model: mujoco.MjModel, names: Sequence[str]) -> Actuators:
         """Look up the actuators of joints."""
-        joint_names = [model.joint(i).name for i in range(model.njnt)]
-        rows = []
-        for name in names:
-            if name not in joint_names:
-                raise SimulationError(f'the scene has no joint "{name}"; {did_you_mean(name, joint_names, "joints")}')
-            rows.append(_actuator_row(model, name))
+        rows = [_actuator_row(model, name) for name in names]
         columns = [np.array(column) for column in zip(*rows, strict=True)]
         return cls(tuple(names), *columns)
 
 
 def _actuator_row(model: mujoco.MjModel, name: str) -> tuple[int | float, ...]:
-    joint = model.joint(name)
+    joint = model.joint(element_id(model, "joint", name))
     actuators = np.flatnonzero((model.actuator_trnid[:, 0] == joint.id) & (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT))
     if len(actuators) != 1:
         raise SimulationError(f'joint "{name}" has {len(actuators)} actuators, expected one position actuator')
