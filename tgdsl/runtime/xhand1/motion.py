@@ -70,6 +70,11 @@ class MotionLimits:
         return cls(lower, upper, (speed,) * NUM_JOINTS, (current_limit,) * NUM_JOINTS, kp, ki, kd, watchdog_s)
 
 
+def joint_of(name: str) -> int | None:
+    """Return which of the hand's joints, by id, goes by a name in a robot file, of either hand; None if none does."""
+    return next((i for i, joint in enumerate(JOINTS) if name == joint or name.endswith(f"_hand_{joint}")), None)
+
+
 def joint_ids(model: mujoco.MjModel) -> Int[np.ndarray, " joint"]:
     """Return which of a model's joints each of the hand's is, in the order of the hand's ids.
 
@@ -77,7 +82,8 @@ def joint_ids(model: mujoco.MjModel) -> Int[np.ndarray, " joint"]:
         MotionError: If the robot lacks a joint, or one has no range.
     """
     names = [model.joint(i).name for i in range(model.njnt)]
-    results = [[i for i, name in enumerate(names) if name == joint or name.endswith(f"_hand_{joint}")] for joint in JOINTS]
+    of_hand = [joint_of(name) for name in names]
+    results = [[i for i, own in enumerate(of_hand) if own == joint] for joint in range(NUM_JOINTS)]
     if lacking := [joint for joint, ids in zip(JOINTS, results, strict=True) if len(ids) != 1 or not model.jnt_limited[ids[0]]]:
         problem = f"an XHand1, real or emulated, is a whole hand: expected one joint with a range for each of {listed(lacking)}"
         raise MotionError(f"{problem}; the robot has {listed(names) or 'none'}")

@@ -28,7 +28,7 @@ from tgdsl.plan.sensors import PlannedObservation, PlannedSensor
 from tgdsl.runtime.connection import Connection
 from tgdsl.runtime.simulators.state_values import Control
 from tgdsl.runtime.xhand1.calibration import Calibration
-from tgdsl.runtime.xhand1.motion import ROUNDING, JointControls, MotionLimits, joint_ids
+from tgdsl.runtime.xhand1.motion import ROUNDING, JointControls, MotionLimits, joint_ids, joint_of
 from tgdsl.runtime.xhand1.source import HandSample, HandSource, control_array, is_chosen
 from tgdsl.runtime.xhand1.wire.errors import MotionError
 from tgdsl.runtime.xhand1.wire.protocol import FINGERS, JOINTS
@@ -132,10 +132,9 @@ def _joint_term(plan: Plan, planned: PlannedObservation, is_log: bool) -> HandTe
         return HandTerm(planned, joints=tuple(actuator_id.index(model.actuator(name).id) for name in rows))
     joints = []
     for name in rows:
-        of_hand = [i for i, joint in enumerate(JOINTS) if name == joint or name.endswith(f"_hand_{joint}")]
-        if not of_hand:
+        if (joint := joint_of(name)) is None:
             raise ObservationError(f'it has no joint "{name}"')
-        joints.append(of_hand[0])
+        joints.append(joint)
     return HandTerm(planned, joints=tuple(joints))
 
 
