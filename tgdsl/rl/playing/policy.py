@@ -20,6 +20,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile, is_zipfile
@@ -94,10 +95,7 @@ def _digest(model: mujoco.MjModel, names: tuple[str, ...]) -> str:
     """Return a hash of arrays to five digits, within which machines and versions of MuJoCo agree."""
     result = hashlib.sha256()
     for name in names:
-        array: Any = model
-        for part in name.split("."):
-            array = getattr(array, part)
-        values = np.asarray(array, dtype=np.float64)
+        values = np.asarray(attrgetter(name)(model), dtype=np.float64)
         rounded = np.where(np.abs(values) < LEAST, 0.0, values) + 0.0
         result.update(f"{name} {values.shape} {' '.join(f'{value:.4e}' for value in rounded.flat)}\n".encode())
     return result.hexdigest()[:16]

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import functools
 import math
-from functools import reduce
 from importlib.metadata import version
+from operator import attrgetter
 from typing import Any, no_type_check
 
 import mujoco
@@ -50,7 +50,7 @@ def constraint_contact_bit(mjw: Any) -> int:
 
 def _part(mjw: Any, path: str) -> Any:
     try:
-        return reduce(getattr, path.split("."), mjw._src)
+        return attrgetter(path)(mjw._src)
     except AttributeError as error:
         tried = ", ".join(TRIED)
         problem = f"MuJoCo Warp {version('mujoco-warp')} has no `{path}`, which contacts are read with"
