@@ -72,7 +72,7 @@ def test_fingertip_forces_are_rounded_and_clipped_to_a_byte():
 def test_unknown_commands_are_refused_and_other_addresses_ignored():
     hand = first_order_hand(2)
     assert hand.answer(Frame(0xFE, 0x80, Command.VERSION), 0.0) is None
-    assert hand.answer(Frame(0xFE, 0x82, Command.RESET), 0.0) == Frame(0x82, 0xFE, 0, b"\x14")
+    assert hand.answer(Frame(0xFE, 0x82, 0x14), 0.0) == Frame(0x82, 0xFE, 0, b"\x14")
     assert hand.answer(Frame(0xFE, 0x82, Command.EXCHANGE, b"short"), 0.0) == Frame(0x82, 0xFE, 0, b"\x02")
     assert hand.answer(Frame(0xFE, 0x82, Command.READ_REGISTER, b"\x35\x00"), 0.0) == Frame(0x82, 0xFE, 0x15, b"\x02")
 

@@ -41,7 +41,6 @@ class Command(IntEnum):
     ERROR = 0x00
     EXCHANGE = 0x02
     VERSION = 0x13
-    RESET = 0x14
     READ_REGISTER = 0x15
 
 
