@@ -19,7 +19,7 @@ from tgdsl.view.cameras import facing_camera, pose_of
 from tgdsl.view.markers import Markers, Pose, is_visible, markers_of
 from tgdsl.view.meshes import mesh_of
 from tgdsl.view.picture import distal, drawing, picture, short_names
-from tgdsl.view.raster import Camera, rasterise
+from tgdsl.view.raster import Camera, Mesh, Viewport, rasterise, shade
 
 TOLERANCE = 1e-9  # metres and pixels: centimetres in float64, a rotation and a sum
 
@@ -173,6 +173,24 @@ def test_nearness_is_interpolated() -> None:
     fragments = rasterise(corners, 5, 4)
     column, row = np.meshgrid(np.arange(5), np.arange(4))
     np.testing.assert_allclose(fragments.nearness, (column + 2) + 2 * (row + 2), atol=TOLERANCE)
+
+
+def test_a_surface_is_lit_from_the_upper_right_and_has_dark_edges() -> None:
+    """A square on pixels 2 to 5 of 8, half a metre before an empty background of 0.9."""
+    corners = np.array([[[2.0, 2, 500], [5, 2, 500], [5, 5, 500]], [[2, 2, 500], [5, 5, 500], [2, 5, 500]]]) / 1000
+    viewport = Viewport(Camera(*np.eye(3), np.zeros(3)), np.zeros(2), 1000.0, 8, 8)
+
+    def shaded(normal: list[float]) -> np.ndarray:
+        mesh = Mesh(corners, np.broadcast_to(np.array(normal), (2, 3, 3)), np.zeros(2, dtype=np.int64))
+        fragments = rasterise(viewport.project(corners), 8, 8)
+        return shade(np.full((8, 8, 3), 0.9), fragments, mesh, np.full((2, 3), 0.5), viewport)[..., 0]
+
+    towards_light, flat, away = (shaded([0.6 * side, 0, 0.8] if side else [0, 0, 1]) for side in (1, 0, -1))
+    assert towards_light[3, 3] > away[3, 3] and flat[3, 3] > away[3, 3]
+    assert shaded([0, 0.6, 0.8])[3, 3] > shaded([0, -0.6, 0.8])[3, 3]
+    np.testing.assert_allclose(shaded([0, 0, -1]), flat)  # surfaces have two sides
+    assert flat[3, 3] == pytest.approx(flat[2, 4]) and flat[7, 7] == 0.9
+    assert max(flat[5, 2:6].max(), flat[2:6, 5].max()) < 0.8 * flat[3, 3]
 
 
 def test_many_overlapping_triangles_take_little_memory() -> None:

@@ -198,7 +198,7 @@ class MirrorStage(Stage):
         self.model, self.num_envs = opening.model, opening.num_envs
         self._source, self._sink, self._env_model = source, sink, opening.model
         self._arrived: SimpleQueue[Frame] = SimpleQueue()
-        self._env, self._is_waiting, self.is_over = 0, False, False
+        self._env, self._is_waiting, self.is_over = opening.frame.env, False, False
         self._take(opening.frame)
         threading.Thread(target=self._listen, daemon=True).start()
 

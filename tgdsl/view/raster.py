@@ -98,8 +98,8 @@ def _draw(fragments: Fragments, corners: Array, face: Array, row: Array, column:
 
 def _scanlines(corners: Array, width: int, height: int) -> tuple[Array, Array, Array, Array]:
     """Return face, row, first and last column of each run of pixels, at least one, that a triangle covers in a row."""
-    low = np.clip(np.ceil(corners[:, :, 1].min(axis=1)), 0, height).astype(int)
-    high = np.clip(np.floor(corners[:, :, 1].max(axis=1)), -1, height - 1).astype(int)
+    low = np.maximum(np.ceil(corners[:, :, 1].min(axis=1)), 0).astype(int)
+    high = np.minimum(np.floor(corners[:, :, 1].max(axis=1)), height - 1).astype(int)
     count = np.maximum(high - low + 1, 0)
     face = np.repeat(np.arange(len(corners)), count)
     row = np.repeat(low, count) + np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
@@ -111,8 +111,8 @@ def _scanlines(corners: Array, width: int, height: int) -> tuple[Array, Array, A
         crossing = np.where((part >= 0) & (part <= 1), x + part * (x_end - x), np.nan)
         left, right = np.fmin(left, crossing), np.fmax(right, crossing)
     left, right = np.where(left > right, 1, left), np.where(left > right, 0, right)
-    first = np.clip(np.ceil(left - 1e-9), 0, width).astype(int)
-    last = np.clip(np.floor(right + 1e-9), -1, width - 1).astype(int)
+    first = np.maximum(np.ceil(left - 1e-9), 0).astype(int)
+    last = np.minimum(np.floor(right + 1e-9), width - 1).astype(int)
     is_run = last >= first
     return face[is_run], row[is_run], first[is_run], last[is_run]
 
