@@ -497,11 +497,12 @@ def test_a_heat_map_has_its_distal_end_up_and_scattered_taxels_as_dots(document)
     assert np.sign(down[0] * right[1] - down[1] * right[0]) == np.sign(outward @ table["normal"][0])  # seen from outside
     scattered = table.copy()
     scattered["row"] = scattered["column"] = -1
-    dots = HeatMaps(scene_model(touch.plan.scene), scattered).image(colour)
-    assert set(np.unique(dots[dots[..., 1] == 7][:, 0])) == set(colour[:, 0])
-    widths = [2 * np.sqrt((dots == each).all(axis=-1).sum() / np.pi) for each in colour]
-    apart = np.linalg.norm(middle(cells[0, 1], dots) - middle(cells[0, 0], dots))
-    np.testing.assert_allclose(widths, apart, rtol=0.03)  # dots of whole pixels touch their neighbours
+    for taxels in (np.arange(len(table)), [cells[0, 0], cells[0, 1], cells[0, 3]]):  # two of the latter are neighbours
+        dots = HeatMaps(scene_model(touch.plan.scene), scattered[taxels]).image(colour[taxels])
+        assert set(np.unique(dots[dots[..., 1] == 7][:, 0])) == set(colour[taxels, 0])
+        widths = [2 * np.sqrt((dots == each).all(axis=-1).sum() / np.pi) for each in colour[taxels]]
+        apart = np.linalg.norm(middle(cells[0, 1], dots) - middle(cells[0, 0], dots))
+        np.testing.assert_allclose(widths, apart, rtol=0.03)  # dots of whole pixels touch their nearest neighbours
 
 
 def test_the_heat_map_has_the_readings_colours(document):
