@@ -18,7 +18,7 @@ import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from tgdsl.runtime.xhand1.wire.errors import HandDisconnectedError, HandError, HandRefusedError, HandTimeoutError
 from tgdsl.runtime.xhand1.wire.protocol import (
@@ -42,6 +42,7 @@ _VERSION_TRIES = 3
 _BABBLE = "the line does not fall silent: something else is sending on it"
 
 
+@runtime_checkable  # for tests that check types
 class Port(Protocol):
     """A line of bytes. Each call may raise `HandDisconnectedError`."""
 
