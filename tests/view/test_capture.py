@@ -27,6 +27,7 @@ class Client:
         return np.full((height, width, 3), 10 * len(self.sizes) % 256, dtype=np.uint8)
 
     def send_file_download(self, filename, content, *, save_immediately):
+        assert save_immediately  # the browser shows no button to click
         self.files.append((filename, content))
 
 
@@ -59,6 +60,15 @@ def test_a_video_plays_in_real_time_and_ends_when_the_browser_disconnects():
 
 def test_a_browser_that_disconnects_at_once_gives_no_video():
     assert record(Client(num_frames=0), threading.Event()) is None
+
+
+def test_a_video_lasts_at_most_a_minute(monkeypatch):
+    """By a clock that is read before and after each frame, and goes on by 7.5 s each time."""
+    clock = iter(np.arange(0.0, 1e3, 7.5))
+    monkeypatch.setattr("tgdsl.view.page.time", SimpleNamespace(monotonic=lambda: next(clock)))
+    client = Client()
+    record(client, threading.Event())
+    assert len(client.sizes) == 4  # begun at 0, 15, 30 and 45 s
 
 
 def test_a_video_ends_when_it_is_stopped():

@@ -127,6 +127,7 @@ def test_a_loops_page_shows_its_frames_and_ends_with_its_process(document, capsy
         page._process.send_signal(signal.SIGINT)  # as Ctrl-C does, for both processes of a terminal
         assert sends(10)
     page.close()
+    assert capsys.readouterr().err == ""
     assert page._process.returncode is not None
     assert page._process.stdin.closed and page._process.stdout.closed
     with pytest.raises(ConnectionRefusedError):

@@ -329,6 +329,7 @@ def test_contacts_are_drawn_and_can_be_switched_off(document):
         assert "1 contact, largest" in page.panel.status.content
         ((begin, end),) = page.scene._forces.points
         np.testing.assert_allclose(begin[:2], [0.01, 0], atol=1e-3)
+        assert page.scene._points.visible
         assert page.scene._forces.visible
         assert end[2] < begin[2]  # the ball presses the pad down
         page.panel.parts["contacts"].value = False

@@ -20,6 +20,7 @@ from tgdsl.view.markers import Markers, Pose, is_visible, markers_of
 from tgdsl.view.meshes import mesh_of
 from tgdsl.view.picture import distal, drawing, picture, short_names
 from tgdsl.view.raster import Camera, Mesh, Viewport, rasterise, shade
+from tgdsl.view.scene import rendered, seen
 
 TOLERANCE = 1e-9  # metres and pixels: centimetres in float64, a rotation and a sum
 
@@ -137,6 +138,23 @@ def test_the_view_has_a_dot_at_each_taxel_and_hotter_ones_last(touch, sim) -> No
     pixels = np.asarray(dots.get_offsets())
     np.testing.assert_allclose(places @ np.linalg.lstsq(places, pixels, rcond=None)[0], pixels, atol=1e-6)
     assert np.ptp(pixels, axis=0).min() > 50
+
+
+def test_the_most_touched_link_has_the_first_map(touch, sim) -> None:
+    links = touch.taxels["touch"]["link"]
+    for first, second in (("pad", "side"), ("side", "pad")):
+        pressed = torch.from_numpy(np.where(links == first, 2.0, 0.01)).expand(2, -1)
+        axes = drawing(touch, sim, {"touch": pressed[..., None].expand(-1, -1, 6)}, reading="touch").axes
+        assert [each.get_label() for each in axes if each.get_label() in links] == [first, second]
+
+
+def test_paint_is_darkened_never_lightened(touch, sim, readings) -> None:
+    """On top of a box, which an edge bounds and light from the side shades."""
+    view = seen(touch, sim, markers(touch, sim, readings, "depth", env=1), 1, 200, 200, "back")
+    drawn = rendered(view, lambda pos, body: np.full((len(pos), 3), 0.5))
+    is_robot = (drawn.fragments.face.reshape(100, 2, 100, 2) >= 0).all(axis=(1, 3))
+    colours = drawn.image[is_robot]
+    assert colours.max() <= 0.5 + 1e-9 and colours.min() < 0.49
 
 
 # Camera and pixels ---------------------------------------------------------------------------------------------------

@@ -117,7 +117,7 @@ def test_a_readings_age_counts_until_now(capsys):
 
 def test_a_hands_table_has_forces_with_bars_and_joints_with_errors(capsys):
     force, error = np.zeros((5, 3), np.int16), np.zeros((12, 3), np.uint16)
-    force[1], error[2, 1] = (3, 4, 12), 0x21
+    force[1], force[3], error[2, 1] = (3, 4, 12), (0, 0, 300), 0x21
     position = np.linspace(0, 1.1, 12).astype(np.float32)
     lines = hand_lines(capsys, reading_at(0.0, total_force=force, joint_error=error, position=position), now=0.0)
     rows = [line.split() for line in lines]
@@ -125,6 +125,7 @@ def test_a_hands_table_has_forces_with_bars_and_joints_with_errors(capsys):
     assert index[:5] == ["index", "3.00", "4.00", "12.00", "13.00"]
     eighths = 8 * index[6].count("█") + " ▏▎▍▌▋▊▉".find(index[6][-1])
     assert eighths == round(8 * 32 * 13 / 255)
+    assert rows[7][6] == 32 * "█"  # 300 is beyond a full bar
     joints = rows[-12:]
     np.testing.assert_allclose([float(row[-4]) for row in joints if row[-1] == "–"], np.delete(position, 2), atol=5e-4)
     assert joints[2][-3:] == ["0x0000", "0x0021", "0x0000"]

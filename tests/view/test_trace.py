@@ -82,6 +82,11 @@ def test_a_full_scene_gets_no_more_spheres(trace):
     assert scene.ngeom == 2
 
 
+def test_the_most_pressed_links_have_bars(trace, monkeypatch):
+    monkeypatch.setattr("tgdsl.view.trace.MAX_MAPS", 1)
+    np.testing.assert_allclose(trace.bars().parts, np.array([[0], [6], [5]]) / 6)
+
+
 def test_bars_are_proportional_to_the_sums_of_links(trace):
     """Relative to 6 N, the left link's largest sum; measured in pixels along the middle of each row."""
     bars = trace.bars()
