@@ -46,6 +46,7 @@ def test_arrows_are_the_projected_vectors(scene):
     readings = {"force": torch.tensor(force), "depth": torch.zeros(2, 6, 1)}
     figure = drawing(touch, sim, readings, env=1, title="both")
     assert [axes.get_title("left").split()[0] for axes in figure.axes] == ["force", "depth"]
+    assert all(0 <= axes.get_position().x0 < axes.get_position().x1 <= 1 for axes in figure.axes)
     (arrows,) = [part for part in figure.axes[0].collections if isinstance(part, Quiver)]
     assert not any(isinstance(part, Quiver) for part in figure.axes[1].collections)
     markers = markers_of(touch, sim, touch.outputs[0], readings["force"], 1)

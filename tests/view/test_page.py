@@ -325,6 +325,13 @@ def test_contacts_are_drawn_and_can_be_switched_off(document):
         contacts = page.stage.contacts(0)
         page.scene.draw_contacts(contacts._replace(force=2.7e-7 / np.linalg.norm(contacts.force) * contacts.force))
         assert not page.scene._forces.visible  # rounding
+        (pos,), (bodies,), (force,) = contacts
+        page.scene.draw_contacts(
+            contacts._replace(pos=np.stack([pos] * 2), bodies=np.stack([bodies] * 2), force=np.stack([0 * force, force]))
+        )
+        assert page.scene._forces.visible
+        assert len(page.scene._points.points) == 2
+        assert len(page.scene._forces.points) == 1  # without one for the contact that carries nothing
         page.draw()
         assert "1 contact, largest" in page.panel.status.content
         ((begin, end),) = page.scene._forces.points

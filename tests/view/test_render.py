@@ -222,6 +222,10 @@ def test_a_link_has_the_colour_of_its_smallest_group(hand: Drawn) -> None:
     assert group_of(layouts["few"]) == ["all", "tips"]
     assert legend(layouts["few"]) == {"other all": 4, "tips": 6}
     assert legend(layouts["many"]) == {"other all": 36, "tips": 2}  # fillers do not count
+    parts = {part.get_gid(): part for part in drawing(*hand, size=SMALL).axes[0].collections}
+    colours = np.concatenate([parts["hidden"].get_edgecolor(), parts["shown"].get_facecolor()])[:, :3]
+    hues = {tuple(hue) for hue in (colours / colours.max(axis=1, keepdims=True)).round(6)}  # shaded discs keep theirs
+    assert len(hues) == 2
 
 
 def test_legend_without_groups() -> None:
