@@ -19,7 +19,7 @@ def document(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def clicks(monkeypatch: pytest.MonkeyPatch) -> dict[str, Callable[[Any], object]]:
-    """What viser is to call on a click, by the label of a button or the name of a node in the scene."""
+    """The functions that viser calls on a click, by the label of a button or the name of a node in the scene."""
     acts: dict[str, Callable[[Any], object]] = {}
     for kind in (viser.GuiButtonHandle, viser.GuiButtonGroupHandle):
         monkeypatch.setattr(kind, "on_click", lambda handle, act: acts.update({handle.label: act}))

@@ -81,16 +81,20 @@ def test_a_video_ends_when_it_is_stopped():
 
 
 def test_buttons_act_for_the_browser_that_clicked(document, clicks):
-    labels, client = list[str](), Client(num_frames=3)
-    stage = SceneStage(tgdsl.compile(document))
+    labels: list[str] = []  # of the video button, at each picture that the browser renders
+
+    class Recorder(Client):
+        def get_render(self, height, width, **options):
+            labels.append(page.panel.record.label)
+            return super().get_render(height, width, **options)
+
+    client, stage = Recorder(num_frames=3), SceneStage(tgdsl.compile(document))
     page = Page(stage, port=8300)
 
     def click(label: str, value: str = "") -> None:
         clicks[label](SimpleNamespace(client=client, target=SimpleNamespace(value=value)))
         page.run(seconds=0.01)
 
-    render = client.get_render
-    client.get_render = lambda *size, **options: (labels.append(page.panel.record.label), render(*size, **options))[1]
     click("time", "step once")
     assert page.panel.paused.value and stage.time == pytest.approx(stage.control_step)
     click("save last minute")

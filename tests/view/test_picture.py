@@ -149,7 +149,7 @@ def test_the_most_touched_link_has_the_first_map(touch, sim) -> None:
 
 
 def test_paint_is_darkened_never_lightened(touch, sim, readings) -> None:
-    """On top of a box, which an edge bounds and light from the side shades."""
+    """Grey paint on the pad, whose sides are shaded."""
     view = seen(touch, sim, markers(touch, sim, readings, "depth", env=1), 1, 200, 200, "back")
     drawn = rendered(view, lambda pos, body: np.full((len(pos), 3), 0.5))
     is_robot = (drawn.fragments.face.reshape(100, 2, 100, 2) >= 0).all(axis=(1, 3))
@@ -256,7 +256,7 @@ def test_shapes_have_mujocos_poses(touch, shape: str, size: str, half: list[floa
     np.testing.assert_allclose(points.max(axis=0), centre + expected, atol=1e-4)
     outward = mesh.corners.mean(axis=1) - centre
     assert ((mesh.normals.mean(axis=1) * outward).sum(axis=1) > 0).all()
-    has_edges = shape in ("box", "cylinder")  # normals of a face are equal there, and differ on a round surface
+    has_edges = shape in ("box", "cylinder")  # a face's corners share a normal there; a round surface has one for each corner
     assert (np.ptp(mesh.normals, axis=1).max(axis=1) < 1e-9).all() == has_edges
 
 
