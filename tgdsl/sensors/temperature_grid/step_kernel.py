@@ -29,7 +29,7 @@ PI = tl.constexpr(3.141592653589793)
 UNROLLED = tl.constexpr(8)  # modes up to which they are written out one by one
 MAX_PAIRS = 32  # pairs of a program, where boxes are small: one for each thread of a warp
 MAX_NUMBERS = 2048  # numbers of a program's block, unless one environment has more
-OF_WARP = 256  # numbers of a block for each warp: eight a thread. Between warps, sums go through shared memory.
+OF_WARP = 128  # numbers of a block for each warp. Between warps, sums go through shared memory.
 
 
 @triton_op("tgdsl::heat_step", mutates_args={})
@@ -135,7 +135,7 @@ def step_kernel(
     over = 1.0 / capacity
     is_cell = (cell < NUM)[:, None] & is_pair[None, :]
     there = (cell < NUM)[:, None] & _is_there(box_x, place[0]) & _is_there(box_y, place[1]) & _is_there(box_z, place[2])
-    at_cell = _in_rows(pair * NUM, cell)
+    at_cell = pair[None, :] * NUM + cell[:, None]
     start = tl.load(cells + at_cell, is_cell, 0.0)
     # Patches.
     size = tl.load(area + pair, is_pair, 0.0)
@@ -180,7 +180,7 @@ def step_kernel(
     # Without contact: conduction, with linear losses and a source; and what modes show of contact, see `response`.
     generated = tl.zeros((CELLS, PAIRS), tl.float32)
     if HAS_SOURCE:
-        generated = tl.load(source + _in_rows(row * NUM, cell), there, 0.0) * (step * over)[None, :]
+        generated = tl.load(source + (row[None, :] * NUM + cell[:, None]), there, 0.0) * (step * over)[None, :]
     weight = tl.where(there, (1.0 / num_there)[None, :], 0.0)
     now = start + lost
     mean = tl.sum(now * weight, axis=0)
@@ -237,9 +237,24 @@ def step_kernel(
 
 
 @triton.jit
-def _in_rows(begin, cell):
-    """Return where cells lie from where their rows begin (C, P). Triton would spread contiguous cells over threads."""
-    return tl.max_contiguous(begin[None, :] + cell[:, None], (1, 1))
+def _sums2(a, b):
+    """Return sums over cells (P): one reduction costs the barriers of one sum."""
+    return tl.reduce((a, b), 0, _add2)
+
+
+@triton.jit
+def _sums3(a, b, c):
+    return tl.reduce((a, b, c), 0, _add3)
+
+
+@triton.jit
+def _add2(a, b, other_a, other_b):
+    return a + other_a, b + other_b
+
+
+@triton.jit
+def _add3(a, b, c, other_a, other_b, other_c):
+    return a + other_a, b + other_b, c + other_c
 
 
 @triton.jit
@@ -271,9 +286,9 @@ def _of_env(values, begin, ROWS: tl.constexpr, PAIRS: tl.constexpr):
 def _mode(vectors, totals, decays, mode, row, place, there, NX: tl.constexpr, NY: tl.constexpr, NZ: tl.constexpr):
     """Return a mode's values in the cells (C, P), their sum, and φ₀ − 1, φ₁ − 1, φ₂ − ½ and φ₃ − ⅙ of it (P)."""
     x, y, z = row * NX + mode // (NY * NZ), row * NY + (mode // NZ) % NY, row * NZ + mode % NZ
-    wave = tl.load(vectors[0] + _in_rows(x * NX, place[0]), there, 0.0)
-    wave *= tl.load(vectors[1] + _in_rows(y * NY, place[1]), there, 0.0)
-    wave *= tl.load(vectors[2] + _in_rows(z * NZ, place[2]), there, 0.0)
+    wave = tl.load(vectors[0] + (x * NX)[None, :] + place[0][:, None], there, 0.0)
+    wave *= tl.load(vectors[1] + (y * NY)[None, :] + place[1][:, None], there, 0.0)
+    wave *= tl.load(vectors[2] + (z * NZ)[None, :] + place[2][:, None], there, 0.0)
     total, at = tl.load(totals[0] + x) * tl.load(totals[1] + y) * tl.load(totals[2] + z), row * (NX * NY * NZ) + mode
     return wave, total, tl.load(decays[0] + at), tl.load(decays[1] + at), tl.load(decays[2] + at), tl.load(decays[3] + at)
 
@@ -283,9 +298,9 @@ def _without_contact(average, end, entered, by_cell, by_side, apart, mean, made,
     """Add a mode to what cells gain without contact, in the mean and at the end, and to what all show: see `response`."""
     wave, total, a, b, c, d = mode
     if HAS_SOURCE:
-        part, mean_wave, warmed = tl.sum(apart * wave, 0), tl.sum(shares * wave, 0), tl.sum(made * wave, 0)
+        part, mean_wave, warmed = _sums3(apart * wave, shares * wave, made * wave)
     else:
-        part, mean_wave = tl.sum(apart * wave, 0), tl.sum(shares * wave, 0)
+        part, mean_wave = _sums2(apart * wave, shares * wave)
     part += mean * total
     of_mean, of_end = part * b, part * a
     if HAS_SOURCE:
@@ -310,7 +325,7 @@ def _with_contact(spread, through, heat, rate, sigma, mode):
     """Add a mode to what cells gain of contact beyond the heat that they get (C, P), and through faces (P)."""
     wave, total, a, b, c, _ = mode
     _, _, of_heat, of_rate = _response((a, b, c, c), sigma)
-    heat_part, rate_part = tl.sum(heat * wave, 0), tl.sum(rate * wave, 0)
+    heat_part, rate_part = _sums2(heat * wave, rate * wave)
     along = heat_part * of_heat + rate_part * of_rate
     return spread + along[None, :] * wave, through + along * total
 
@@ -344,7 +359,7 @@ def _face(
     ends, film, row, place, NUM: tl.constexpr, there, side, k, heat, num_there, AXIS: tl.constexpr, HAS_FILM: tl.constexpr
 ):
     """Return exposed area over heat capacity (C, P), resistance, and what modes lose (P), of faces across an axis."""
-    ends = tl.load(ends + _in_rows(row * NUM, place), there, 0.0)
+    ends = tl.load(ends + (row * NUM)[None, :] + place[:, None], there, 0.0)
     exposed = tl.sum(ends, axis=0) / num_there
     lost = tl.zeros_like(side)
     if HAS_FILM:
@@ -485,14 +500,14 @@ def _touched(
     a, b, c, d = _response(by_cell, sigma[None, :])
     ra, rb, rc, rd = _response(by_side, sigma)
     squared = shares * shares
-    own_a, own_b = tl.sum(squared * a, 0), tl.sum(squared * b, 0)
-    own_c, own_d = tl.sum(squared * c, 0), tl.sum(squared * d, 0)
+    own_a, own_b = _sums2(squared * a, squared * b)
+    own_c, own_d = _sums2(squared * c, squared * d)
     ra, rb, rc, rd = (ra - own_a) * over, (rb - own_b) * over, (rc - own_c) * over, (rd - own_d) * over
     # Cells: H and J are f S (temperatures of the node − free).
     per = flow * over[None, :]
     sa, sb, sc, sd = _inverted(1.0 + per * a, per * b, per * c, 1.0 + per * d)
-    ya, yb, one = tl.sum(flow * sa, 0), tl.sum(flow * sb, 0), tl.sum(flow * (sa * average + sb * end), 0)
-    yc, yd, other = tl.sum(flow * sc, 0), tl.sum(flow * sd, 0), tl.sum(flow * (sc * average + sd * end), 0)
+    ya, yb, one = _sums3(flow * sa, flow * sb, flow * (sa * average + sb * end))
+    yc, yd, other = _sums3(flow * sc, flow * sd, flow * (sc * average + sd * end))
     # Sides: H and J are F (Y (temperatures of the node) − …).
     fa, fb, fc, fd = _inverted(1.0 + ya * ra + yb * rc, ya * rb + yb * rd, yc * ra + yd * rc, 1.0 + yc * rb + yd * rd)
     za, zb, zc, zd = fa * ya + fb * yc, fa * yb + fb * yd, fc * ya + fd * yc, fc * yb + fd * yd
