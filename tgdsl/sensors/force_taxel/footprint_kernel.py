@@ -117,11 +117,11 @@ def footprint_kernel(
         for start in range(0, num_contacts, GROUP):
             if not ONE_GROUP:
                 contacts = _contacts(planes, normals, row, is_env, start, num_contacts, box, inverse, GROUP)
-            point, force, torque, normal, strength, way, away, is_beside, is_any = contacts
+            point, force, torque, normal, strength, way, away, is_any = contacts
             if is_any:
                 slope = _slope(way, tilt, inverse)
                 captured, norm, top, mean, covariance = _moments(
-                    pos, weights, num_here, point, normal, slope, inverse, away, is_beside, IS_LONG
+                    pos, weights, num_here, point, normal, slope, inverse, away, IS_LONG
                 )
                 load = captured * strength
                 total += tl.sum(load, axis=1)
@@ -138,11 +138,11 @@ def footprint_kernel(
     for start in range(0, tl.maximum(num_contacts, 1), GROUP):
         if not ONE_GROUP:
             contacts = _contacts(planes, normals, row, is_env, start, num_contacts, box, inverse, GROUP)
-        point, force, torque, normal, strength, way, away, is_beside, is_any = contacts
+        point, force, torque, normal, strength, way, away, is_any = contacts
         if is_any | (start == 0):
             slope = _slope(way, tilt, inverse)
             captured, norm, top, mean, covariance = _moments(
-                pos, weights, num_here, point, normal, slope, inverse, away, is_beside, IS_LONG
+                pos, weights, num_here, point, normal, slope, inverse, away, IS_LONG
             )
             unmet = add3(unmet, _unmet(captured, mean, force, torque))
             each = scale3(tl.where(norm == 0, 0.0, captured / norm), force)
@@ -197,8 +197,8 @@ def _contacts(planes, normals, row, is_env, start, num_contacts, box, inverse, G
     is_any = tl.max(tl.max((acts | is_strange).to(tl.int32), axis=1), axis=0) != 0
     normal = _load(normals[0] + at, is_contact), _load(normals[1] + at, is_contact), _load(normals[2] + at, is_contact)
     strength, way = _direction((fx, fy, fz))
-    away, is_beside = _away(box, (px, py, pz), (fx, fy, fz), inverse)
-    return (px, py, pz), (fx, fy, fz), (tx, ty, tz), normal, strength, way, away, is_beside, is_any
+    away = _away(box, (px, py, pz), (fx, fy, fz), inverse)
+    return (px, py, pz), (fx, fy, fz), (tx, ty, tz), normal, strength, way, away, is_any
 
 
 @triton.jit
@@ -259,28 +259,18 @@ def _pull(arm, facing, weight, slope, top, inverse):
 
 @triton.jit
 def _away(box, point, force, inverse):
-    """Return the way from contacts to the box of the taxels, (env, contact) [m], and whether one with a force is outside it."""
+    """Return the way from contacts to the box of the taxels, (env, contact) [m], 0 where they are in it or have no force."""
     x = tl.clamp(point[0], tl.load(box), tl.load(box + 3)) - point[0]
     y = tl.clamp(point[1], tl.load(box + 1), tl.load(box + 4)) - point[1]
     z = tl.clamp(point[2], tl.load(box + 2), tl.load(box + 5)) - point[2]
     acts = (force[0] != 0) | (force[1] != 0) | (force[2] != 0)
     is_beside = acts & (inverse * inverse * (x * x + y * y + z * z) > BESIDE * BESIDE)
-    return (x, y, z), tl.max(tl.max(is_beside.to(tl.int32), axis=1), axis=0) != 0
+    return tl.where(is_beside, x, 0.0), tl.where(is_beside, y, 0.0), tl.where(is_beside, z, 0.0)
 
 
 @triton.jit
-def _moments(pos, weights, num_here, point, normal, slope, inverse, away, is_beside, IS_LONG: tl.constexpr):
+def _moments(pos, weights, num_here, point, normal, slope, inverse, away, IS_LONG: tl.constexpr):
     """Return γ, the shares' sum and its exponent, and mean [m] and covariance [m²] of the arms: (env, contact)."""
-    if is_beside:
-        result = _moments_about(pos, weights, num_here, point, normal, slope, inverse, away, IS_LONG, True)
-    else:
-        result = _moments_about(pos, weights, num_here, point, normal, slope, inverse, away, IS_LONG, False)
-    return result
-
-
-@triton.jit
-def _moments_about(pos, weights, num_here, point, normal, slope, inverse, away, IS_LONG: tl.constexpr, IS_BESIDE: tl.constexpr):
-    """Return `_moments` with sums about the contacts, or about the points `away` from them."""
     zero = tl.zeros_like(point[0])
     top = zero
     if IS_LONG:
@@ -293,8 +283,7 @@ def _moments_about(pos, weights, num_here, point, normal, slope, inverse, away, 
         weight = tl.load(weights + taxel)[:, None]
         near, part = _pull(arm, facing, weight, slope, top, inverse)
         nearest = tl.maximum(nearest, near, propagate_nan=tl.PropagateNan.ALL)
-        if IS_BESIDE:
-            arm = _arm(arm, away)
+        arm = _arm(arm, away)
         px, py, pz = part * arm[0], part * arm[1], part * arm[2]
         total += part
         x, y, z = x + px, y + py, z + pz
@@ -308,7 +297,7 @@ def _moments_about(pos, weights, num_here, point, normal, slope, inverse, away, 
         norm * xx - x * x, norm * xy - x * y, norm * xz - x * z,
         norm * yy - y * y, norm * yz - y * z, norm * zz - z * z,
     )  # fmt: skip
-    mean = (x + away[0], y + away[1], z + away[2]) if IS_BESIDE else (x, y, z)
+    mean = x + away[0], y + away[1], z + away[2]
     return captured, total, top, mean, spread
 
 
