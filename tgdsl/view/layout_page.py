@@ -194,7 +194,6 @@ class LayoutPage:
 
     def _add_scene(self) -> None:
         scene, pose = self.server.scene, pose_of(self._model, None)
-        scene.set_up_direction("+z")
         self._frames = {}
         for body in range(self._model.nbody):
             name = self._model.body(body).name

@@ -36,7 +36,6 @@ class LiveScene:
         self._near, robot = robot_bodies(stage.model, self._carriers)
         self.robot = frozenset(robot | {0})
         scene = server.scene
-        scene.set_up_direction("+z")
         self.frames = {body: scene.add_frame(f"/body{body}", show_axes=False) for body in range(stage.model.nbody)}
         self._meshes: dict[int, list[tuple[Any, Any]]] = {}
         for body in range(stage.model.nbody):
