@@ -270,7 +270,7 @@ def test_a_saved_layout_is_shown(document):
     assert watch() is None
 
 
-def test_choosing_another_environment_restarts_the_plot(document):
+def test_the_plot_restarts_with_another_environment_channel_or_an_earlier_time(document):
     with opened(SceneStage(tgdsl.compile(document), num_envs=2)) as page:
         page.run(seconds=0.3)
         assert len(page._history) > 1
@@ -279,6 +279,17 @@ def test_choosing_another_environment_restarts_the_plot(document):
         page._react()
         page.draw()
         assert len(page._history) == 1
+        for time_then in (5.0, 20.0, 25.0):
+            page.stage.time = time_then
+            page.draw()
+        np.testing.assert_array_equal(page.panel.plot.data[0], [20, 25])  # the last ten seconds
+        for time_then in (22.0, 23.0):  # of a recorded run
+            page.stage.time = time_then
+            page.draw()
+        np.testing.assert_array_equal(page.panel.plot.data[0], [22, 23])
+        page.panel.channel.value = "force_x"
+        page._react()
+        assert not page._history
 
 
 def test_saved_frames_match_the_drawn_ones(document):

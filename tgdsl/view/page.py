@@ -199,8 +199,10 @@ class Page:
             name = f"**{layer.total}**" if panel.plotted.value == EVERY else f"**{layer.total} of {panel.plotted.value}**"
             self.scene.name_row(rows, None, poses)
         panel.value.content = f"{name}: {current.quantity} {value:.4g} {current.unit}"
+        if self._history and self.stage.time < self._history[-1][0]:
+            self._history.clear()
         self._history.append((self.stage.time, value))
-        while not 0 <= self.stage.time - self._history[0][0] <= PLOT_SECONDS:
+        while self.stage.time - self._history[0][0] > PLOT_SECONDS:
             self._history.popleft()
         if len(self._history) > 1:
             times, values = np.array(self._history).T
@@ -267,6 +269,8 @@ class Page:
             self._show_readings()
         elif panel.channel.value not in self.scene.layers[0].channels:
             panel.channel.value = self.scene.layers[0].channels[0]
+        if self._changed("channel", panel.channel.value):
+            self._history.clear()
         if self._changed("env", panel.env_index) | self._changed("plotted", panel.plotted.value):
             self._history.clear()
             for sound in self._sounds.values():
@@ -333,7 +337,6 @@ class Page:
 
     def _restart(self) -> None:
         self.stage.restart()
-        self._history.clear()
         if self.panel.sliders and self.stage.control is not None:
             self.panel.set_sliders(self.stage.control)
 
