@@ -39,10 +39,12 @@ from tgdsl.scene.scene import scene_model
 from tgdsl.schema.load import load_layout
 from tgdsl.view.hand_stage import HandLogStage, LiveHandStage
 from tgdsl.view.layout_page import LayoutPage
+from tgdsl.view.live_scene import ARROW
 from tgdsl.view.meshes import body_surfaces
-from tgdsl.view.page import Page
+from tgdsl.view.page import MAX_STEPS, Page
 from tgdsl.view.picture import HeatMaps
 from tgdsl.view.stages import RunStage, SceneStage, Stage
+from tgdsl.view.style import LIVE_OBJECT, LIVE_OTHER, LIVE_REST, LIVE_SENSING
 
 ROOT = Path(__file__).parents[2]
 TWO_BALLS = "variants: [{type: sphere, size: [20 mm], density: 6000}, {type: sphere, size: [15 mm], density: 6000}]"
@@ -84,12 +86,26 @@ def test_the_most_pressed_taxel_has_the_hottest_colour_and_its_reading_is_shown(
         for _ in range(100):
             page.stage.advance()
         page.draw()
-        force = page.stage.readings["touch"][0].norm(dim=-1)
+        contact = np.linalg.norm(page.stage.contacts(0).force)
+        assert page.panel.status.content == f"t = 1.00 s · 16 taxels · 1 contact, largest {contact:.3g} N"
+        force = page.stage.readings["touch"][0, :, :3].norm(dim=-1)
         disc = disc_of(page)
         hottest = int(force.argmax())
         assert force[hottest] > 0.01
         blue = disc.batched_colors[:, 2].astype(int)
-        assert blue[hottest] == blue[force.numpy() > 0].min()
+        is_read = force.numpy() > 1e-3
+        assert blue[hottest] == blue[is_read].min() < blue[is_read].max()
+        np.testing.assert_array_equal((disc.batched_colors == LIVE_REST).all(axis=1), ~is_read)
+        assert "|force| [N]" in page.panel.legend.content and "<span>0</span>" in page.panel.legend.content
+        page.panel.channel.value = "force_z"
+        page.draw()
+        pressed = page.stage.readings["touch"][0, :, 2]
+        assert pressed[hottest] < 0
+        red, _, blue = disc_of(page).batched_colors.astype(int).T  # from blue, of negative values, to red
+        assert blue[hottest] - red[hottest] == (blue - red).max() > 100
+        most = f"{float(pressed.abs().max()):.3g}"
+        assert f"<span>-{most}</span><span>{most}</span>" in page.panel.legend.content
+        page.panel.channel.value = "magnitude"
         page._pick(hottest)
         page.draw()
         assert f"taxel {hottest}" in page.panel.value.content
@@ -111,10 +127,13 @@ def test_a_slider_moves_its_actuator_and_a_keyframe_moves_the_sliders(document):
 def test_another_reading_has_its_own_channels(document):
     touch = tgdsl.compile(document)
     with opened(SceneStage(touch)) as page:
+        discs = disc_of(page)
         page.panel.channel.value = "force_x"
         page.panel.reading.value = "near"
         page._react()
         page.draw()
+        with pytest.warns(UserWarning, match="already removed"):
+            discs.remove()
         channels = next(output.channels for output in touch.outputs if output.name == "near")
         assert page.panel.channel.options == ("magnitude", *channels)
         assert page.panel.channel.value == "magnitude"
@@ -149,6 +168,39 @@ def test_pause_stops_and_step_once_takes_one_step(document):
         assert page.stage.time == 0
         page._step_once()
         assert page.stage.time == pytest.approx(page.stage.control_step)
+
+
+def test_a_scene_runs_in_real_time_times_the_speed(document, monkeypatch):
+    """By a clock that goes on only while the page waits, or works as long as `work` says."""
+    clock = SimpleNamespace(now=100.0)
+
+    def wait(seconds: float) -> None:
+        clock.now += seconds
+
+    monkeypatch.setattr("tgdsl.view.page.time", SimpleNamespace(monotonic=lambda: clock.now, sleep=wait))
+    with opened(SceneStage(tgdsl.compile(document))) as page:
+
+        def run(seconds: float, work: float = 0.0) -> tuple[int, float]:
+            """Return how many frames a run has, and for how long the scene goes on."""
+            starts, before = list[float](), page.stage.time
+
+            def watch() -> None:
+                starts.append(clock.now)
+                assert starts[-31:] == starts or starts[-1] > starts[-31]  # the page waits between frames
+                wait(work)
+
+            page.run(watch, seconds)
+            return len(starts), page.stage.time - before
+
+        frames, elapsed = run(0.7)
+        assert frames == pytest.approx(30 * 0.7, abs=1)
+        assert 0.65 < elapsed <= 0.7  # the first frame has no step
+        page.panel.speed.value = 0.5
+        assert run(0.7)[1] == pytest.approx(0.35, abs=0.03)
+        frames, elapsed = run(1.0, work=0.5)
+        assert frames == 2 and elapsed == pytest.approx(MAX_STEPS * page.stage.control_step)
+        page.panel.paused.value = True
+        assert run(0.3)[1] == 0
 
 
 @pytest.fixture(scope="module")
@@ -210,6 +262,16 @@ def test_another_stage_replaces_the_discs_and_all_bodies(document, tmp_path):
         assert len(disc_of(page).batched_positions) == len(first.batched_positions)
         with pytest.warns(UserWarning, match="already removed"):
             mesh.remove()
+
+
+def test_the_camera_and_the_chosen_reading_stay_with_another_stage(document):
+    touch = tgdsl.compile(document)
+    with opened(SceneStage(touch)) as page:
+        page.server.initial_camera.position = (1.0, 2.0, 3.0)
+        page.panel.reading.value = "near"
+        page.show(SceneStage(touch))
+        assert page.panel.reading.value == "near" and page.scene.layers[0].output.name == "near"
+        np.testing.assert_array_equal(page.server.initial_camera.position, (1, 2, 3))
 
 
 def test_a_stage_with_nothing_to_draw_keeps_the_previous_one_and_shows_a_problem(document):
@@ -349,7 +411,7 @@ def test_contacts_are_drawn_and_can_be_switched_off(document):
         np.testing.assert_allclose(begin[:2], [0.01, 0], atol=1e-3)
         assert page.scene._points.visible
         assert page.scene._forces.visible
-        assert end[2] < begin[2]  # the ball presses the pad down
+        assert begin[2] - end[2] == pytest.approx(ARROW, rel=1e-3)  # the ball presses the pad down
         page.panel.parts["contacts"].value = False
         page.draw()
         assert not page.scene._points.visible
@@ -360,25 +422,39 @@ def test_arrows_lead_from_the_taxels_along_their_forces(tmp_path):
     (tmp_path / "press.xml").write_text(SCENE.replace('"pad" pos="0 0 0.05"', '"pad" pos="0 0 0.05" euler="10 0 30"'))
     (tmp_path / "press.yaml").write_text(WITHOUT_PROXIMITY)
     with opened(SceneStage(tgdsl.compile(tmp_path / "press.yaml"))) as page:
+        first = float(page.stage.readings["touch"][0, :, :3].norm(dim=-1).max())
         for _ in range(100):
             page.stage.advance()
         page.draw()
         force = page.stage.readings["touch"][0, :, :3].double().numpy()
         is_read, turn = np.linalg.norm(force, axis=1) > 1e-3, Rotation.from_euler("XYZ", [10, 0, 30], degrees=True)
         taxels = turn.apply(page.stage.touch.taxels["touch"]["pos"][is_read]) + [0, 0, 0.05]
-        arrows = page.scene._arrows
+        arrows, camera = page.scene._arrows, page.server.initial_camera
+        np.testing.assert_allclose(camera.look_at, turn.apply([0, 0, 0.005]) + [0, 0, 0.05], atol=1e-6)
+        away = np.asarray(camera.position) - camera.look_at
+        assert away @ turn.apply([0, 0, 1]) > 0.85 * np.linalg.norm(away)
+        assert camera.near < 0.05 < np.linalg.norm(away) < 0.15  # the taxels are up to 3 cm from the middle
         assert arrows.visible and 0 < is_read.sum() < 16
         assert np.linalg.norm(arrows.points[:, 0] - taxels, axis=1).max() < 3e-4  # lifted off the surface
         along, expected = arrows.points[:, 1] - arrows.points[:, 0], turn.apply(force[is_read])
         np.testing.assert_allclose(along / np.linalg.norm(along), expected / np.linalg.norm(expected), atol=1e-5)  # float32
+        largest = np.linalg.norm(force, axis=1).max()
+        assert np.linalg.norm(along, axis=1).max() == pytest.approx(ARROW * largest / max(first, largest), rel=1e-5)
+        page._pick(int(np.flatnonzero(is_read)[0]))
+        page.draw()
+        assert np.linalg.norm(page.scene._name.position - taxels[0]) < 1e-3
+        rows, shown = page.scene.layers[0].rows, page.scene.layers[0].read(page.stage.readings["touch"], 0, "magnitude")
+        page.scene.draw_arrows(rows, shown, page.stage.body_poses(0), np.arange(16) == shown.value.argmax())
+        assert arrows.visible and len(arrows.points) == 1
         page.panel.parts["arrows"].value = False
         page.draw()
         assert not arrows.visible
 
 
-def test_links_groups_and_sensors_can_be_switched_on_and_off(tmp_path):
-    side = '<body name="side" pos="0 .1 .05"><geom name="side" type="box" size=".02 .02 .005"/></body>'
-    (tmp_path / "press.xml").write_text(SCENE.replace('<body name="ball"', f'{side}<body name="ball"'))
+def test_parts_links_groups_and_sensors_can_be_switched_on_and_off(tmp_path):
+    side = '<body name="side" pos="0 .1 .05"><geom name="side" type="box" size=".02 .02 .005" rgba="0 1 0 1"/></body>'
+    table = '<geom type="box" pos="0 0 -.1" size=".2 .2 .01"/>'
+    (tmp_path / "press.xml").write_text(SCENE.replace('<body name="ball"', f'{table}{side}<body name="ball"'))
     grid = "{method: grid, rows: 2, columns: 2, direction: [0, 0, -1], radius: 6 mm}"
     text = DOCUMENT.replace("{pad: {", f"{{side: {grid}, pad: {{").replace("{all: [pad]}", "{all: [pad, side], one: [side]}")
     (tmp_path / "press.yaml").write_text(text)
@@ -390,8 +466,10 @@ def test_links_groups_and_sensors_can_be_switched_on_and_off(tmp_path):
             return {link for handle, link, _ in page.scene.layers[0].members if handle.visible}
 
         assert visible_links() == {"pad", "side"}
+        assert not page.panel.value.content.endswith(" 0 N")
         page.panel.links["pad"].value = False
         assert visible_links() == {"side"}
+        assert page.panel.value.content == "**sum**: |force| 0 N"  # the ball lies on the other link
         page.panel.group.value = "one"
         page.panel.links["pad"].value = True
         assert visible_links() == {"side"}
@@ -402,10 +480,28 @@ def test_links_groups_and_sensors_can_be_switched_on_and_off(tmp_path):
         assert [layer.output.name for layer in page.scene.layers] == ["touch"]
         page.panel.also["near"].value = True
         page._react()
+        page.draw()
         assert [layer.output.name for layer in page.scene.layers] == ["touch", "near"]
+        below, above = ({link: handle for handle, link, _ in layer.members}["pad"] for layer in page.scene.layers)
+        assert (above.batched_positions[:, 2] > below.batched_positions[:, 2]).all()
+        assert (above.batched_scales < below.batched_scales).all()
+        assert (above.batched_colors != LIVE_REST).any()  # the ball is near
+
+        def meshes() -> dict[str, tuple[bool, tuple[int, ...]]]:
+            """Return by body whether its mesh is visible, and the mesh's colour."""
+            page._react()
+            names = {page.stage.model.body(body).name: handles for body, handles in page.scene._meshes.items()}
+            return {name: (mesh.visible, tuple(mesh.color)) for name, ((mesh, _),) in names.items()}
+
+        robot = {"world": (True, LIVE_OTHER), "pad": (True, LIVE_SENSING), "side": (True, LIVE_SENSING)}
+        assert meshes() == {**robot, "ball": (True, LIVE_OBJECT)}
+        page.panel.is_plain.value = False
+        assert meshes() == {**robot, "side": (True, (0, 255, 0)), "ball": (True, LIVE_OBJECT)}
         page.panel.parts["robot"].value = False
-        page._react()
-        assert {mesh.visible for body in page.scene.robot for mesh, _ in page.scene._meshes[body]} == {False}
+        assert {name for name, (is_visible, _) in meshes().items() if is_visible} == {"ball"}
+        page.panel.parts["objects"].value = False
+        assert not any(is_visible for is_visible, _ in meshes().values())
+        assert not any(frame.show_axes for frame in page.scene.frames.values())
 
 
 def test_a_chosen_link_is_plotted_and_a_clicked_taxel_named(document, clicks):
@@ -465,11 +561,9 @@ def test_another_environment_shows_its_own_object(document):
 
 def test_temperatures_colour_the_surfaces_of_links(document, clicks):
     warm = document.with_name("warm.yaml")
-    objects = "{body: ball, material: aluminium, temperature: 60 degC}"
-    sensors = (
-        "  heat: {kind: temperature_grid, links: all, feels: [ball], spacing: 10 mm, material: aluminium, outputs: surface}\n"
-    )
-    warm.write_text(DOCUMENT.split("sensors:")[0].replace("{body: ball}", objects) + "sensors:\n" + sensors)
+    objects = "{ball: {body: ball, material: aluminium, temperature: 60 degC}}"
+    heat = "{kind: temperature_grid, links: [pad], feels: [ball], spacing: 10 mm, material: aluminium, outputs: surface}"
+    warm.write_text(f"tgdsl: 1\nrobot: {{model: press.xml}}\nobjects: {objects}\nsensors: {{heat: {heat}}}\n")
     with opened(SceneStage(tgdsl.compile(warm))) as page:
         for _ in range(100):
             page.stage.advance()
@@ -492,6 +586,7 @@ def test_temperatures_colour_the_surfaces_of_links(document, clicks):
         clicks[drawn.name](None)
         page._react()
         page.draw()
+        assert "temperature [°C]" in page.panel.legend.content and " cells" in page.panel.status.content
         assert page.panel.value.content.startswith(f"**pad, cell {values.argmax()}** at ")
         assert f"{values.max():.4g} °C" in page.panel.value.content
 
