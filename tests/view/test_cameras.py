@@ -295,6 +295,20 @@ def test_the_one_pad_that_is_touched_is_faced(tmp_path, pad):
     assert (markers.normal[is_touched.numpy()] @ camera.toward).min() > 0.85
 
 
+def test_names_of_links_are_at_the_nearer_edge_with_a_line_to_the_taxels(tmp_path, monkeypatch):
+    monkeypatch.setattr("tgdsl.view.picture.SIZE", (4.0, 2.25))  # of few pixels, which take less time
+    touch, sim = gripper(tmp_path, 1)
+    axes = picture_of(touch, sim, {"touch": torch.ones(1, 24, 3)}).axes[0]
+    places = np.concatenate([part.get_offsets() for part in axes.collections])
+    is_left = places[:, 0] < places[:, 0].mean()
+    left, right = sorted((text for text in axes.texts if text.get_text() in ("left", "right")), key=lambda text: text.xy[0])
+    for text, is_side, edge in ((left, is_left, 0), (right, ~is_left, np.ptp(axes.get_xlim()))):
+        assert is_side.sum() == 12
+        np.testing.assert_allclose(text.xy, places[is_side].mean(axis=0), atol=1e-6)
+        assert text.get_position() == (edge, text.xy[1])
+    assert (left.get_ha(), right.get_ha()) == ("left", "right")
+
+
 @pytest.mark.slow
 def test_run_draws_from_the_given_view(tmp_path, here):
     view = "-60,25"

@@ -1,5 +1,7 @@
 """The overview: a panel per reading, with arrows along vectors."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -9,11 +11,13 @@ from scipy.spatial.transform import Rotation
 import tgdsl
 from tgdsl.view.cameras import ViewError
 from tgdsl.view.markers import markers_of
-from tgdsl.view.overview import drawing, overview
+from tgdsl.view.overview import ARROW, drawing, overview
 
 SCENE = """
 <mujoco><worldbody>
-  <body name="pad" pos=".1 .2 .3" euler="20 30 40"><joint/><geom type="box" size=".02 .02 .01"/></body>
+  <body name="arm"><geom type="capsule" fromto="0 0 .3 -.3 -.2 .3" size=".01"/>
+    <body name="pad" pos=".1 .2 .3" euler="20 30 40"><joint/><geom type="box" size=".02 .02 .01"/></body>
+  </body>
   <body name="ball" pos="0 0 1"><freejoint/><geom type="sphere" size=".03"/></body>
 </worldbody></mujoco>
 """
@@ -58,11 +62,55 @@ def test_arrows_are_the_projected_vectors(scene):
     to_pixels = np.linalg.lstsq(np.column_stack([markers.pos[is_read], np.ones(5)]), positions, rcond=None)[0][:3]
     expected = world[is_read] @ to_pixels
     np.testing.assert_allclose(drawn / np.linalg.norm(drawn), expected / np.linalg.norm(expected), atol=1e-9)
+    width = np.ptp(figure.axes[0].get_xlim())
+    assert 0.7 * ARROW * width < np.linalg.norm(drawn, axis=1).max() <= ARROW * width
+
+
+def test_the_picture_shows_the_pad_under_its_taxels_and_a_scale(scene):
+    """Pixels are a linear map of the plane of the pad's upper side."""
+    touch, sim = scene
+    depth = torch.tensor([1e-3, 0, 2e-3, 0, 3e-3, 4e-3]).expand(2, -1)[..., None]
+    figure = drawing(touch, sim, {"depth": depth})
+    (axes,) = figure.axes
+    rest, _, read = (np.asarray(part.get_offsets()) for part in axes.collections)
+    taxels = markers_of(touch, sim, touch.outputs[1], depth, 0).pos[[1, 3, 0, 2, 4, 5]]  # the hottest is drawn last
+    middle, dots = taxels.mean(axis=0), np.vstack([rest, read])
+    to_pixels = np.linalg.lstsq(taxels - middle, dots - dots.mean(axis=0), rcond=None)[0]
+    np.testing.assert_allclose((taxels - middle) @ to_pixels, dots - dots.mean(axis=0), atol=1e-6)
+    turn = Rotation.from_euler("XYZ", [20, 30, 40], degrees=True)
+    corners = turn.apply([[x, y, 0.01] for x in (-0.02, 0.02) for y in (-0.02, 0.02)]) + [0.1, 0.2, 0.3]
+    column, row = ((corners - middle) @ to_pixels + dots.mean(axis=0)).T
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    assert left < column.min() and column.max() < right and bottom < row.min() and row.max() < top
+    assert max(np.ptp(column) / (right - left), np.ptp(row) / (top - bottom)) > 0.6  # the arm may be out of the picture
+    (image,) = axes.images
+    assert tuple(image.get_extent()) == (left, right, bottom, top)
+    pixels = image.get_array()
+    column, row = 0.97 * column + 0.03 * column.mean(), 0.97 * row + 0.03 * row.mean()
+    at = (row - bottom) / (top - bottom) * len(pixels), (column - left) / (right - left) * pixels.shape[1]
+    assert pixels[at[0].astype(int), at[1].astype(int)].max() < 0.95
+    assert (pixels == 1).all(axis=2).mean() > 0.1  # the background is white
+    (bar,) = axes.lines
+    (scale,) = (text for text in axes.texts if re.fullmatch(r"\d+ mm", text.get_text()))
+    pixels_per_metre = np.linalg.svd(to_pixels, compute_uv=False)[0]
+    assert np.ptp(bar.get_xdata()) == pytest.approx(1e-3 * int(scale.get_text().split()[0]) * pixels_per_metre)
+    assert 0.05 < np.ptp(bar.get_xdata()) / (right - left) < 0.25
+    assert left <= bar.get_xdata().min() and scale.get_position()[0] > bar.get_xdata()[-1]
+    assert not axes.axison
+
+
+def test_taxels_behind_the_pad_are_rings_if_they_read_and_a_panel_alone_is_larger(scene):
+    touch, sim = scene
+    depth = torch.tensor([1e-3, 0, 2e-3, 0, 3e-3, 4e-3]).expand(2, -1)[..., None]
+    front, back = (drawing(touch, sim, {"depth": depth}, view=view) for view in ("front", "back"))
+    for figure, expected in ((front, [2, 0, 4]), (back, [0, 4, 0])):
+        assert [len(part.get_offsets()) for part in figure.axes[0].collections] == expected
+    assert front.get_figwidth() > drawing(touch, sim, {"depth": depth, "force": torch.zeros(2, 6, 3)}).get_figwidth() / 2
 
 
 def test_each_active_panel_has_a_colour_bar(scene):
     touch, sim = scene
-    readings = {"force": torch.full((2, 6, 3), 2e-7), "depth": torch.full((2, 6, 1), 3e-3)}
+    readings = {"force": torch.full((2, 6, 3), 2e-7), "depth": torch.tensor([3e-3, 0, 0, 0, 0, 0]).expand(2, -1)[..., None]}
     force, depth = drawing(touch, sim, readings).axes[:2]
     assert not force.child_axes  # nothing is above 1 mN
     assert not any(isinstance(part, Quiver) for part in force.collections)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from matplotlib.colors import to_rgb
 
 import tgdsl
 from tgdsl.compiler.pipeline import placed
@@ -18,9 +19,10 @@ from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.view.cameras import facing_camera, pose_of
 from tgdsl.view.markers import Markers, Pose, is_visible, markers_of
 from tgdsl.view.meshes import mesh_of
-from tgdsl.view.picture import distal, drawing, picture, short_names
+from tgdsl.view.picture import HeatMaps, _draw_names, distal, drawing, picture, short_names
 from tgdsl.view.raster import Camera, Mesh, Viewport, rasterise, shade
 from tgdsl.view.scene import rendered, seen
+from tgdsl.view.style import REST, new_figure
 
 TOLERANCE = 1e-9  # metres and pixels: centimetres in float64, a rotation and a sum
 
@@ -76,6 +78,12 @@ def readings(touch: TactileModule, sim: BatchSimulation) -> dict[str, torch.Tens
     return touch(sim.state())
 
 
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures of few pixels, which take less time."""
+    monkeypatch.setattr("tgdsl.view.picture.SIZE", (4.0, 2.25))
+
+
 def markers(touch: TactileModule, sim: BatchSimulation, readings: dict[str, torch.Tensor], name: str, env: int = 0) -> Markers:
     output = next(output for output in touch.outputs if output.name == name)
     return markers_of(touch, sim, output, readings[name], env)
@@ -127,25 +135,72 @@ def test_summary_adds_forces_but_not_depths() -> None:
     assert contact.summary() == "Σ 2"
 
 
-def test_the_view_has_a_dot_at_each_taxel_and_hotter_ones_last(touch, sim) -> None:
+def test_the_view_has_a_dot_at_each_taxel_and_hotter_ones_last(touch, sim, small) -> None:
     """Pixels of an orthographic view are a linear map of positions: fit it to all dots but check each."""
     depth = 1e-4 * (1.0 + torch.randperm(36, generator=torch.Generator().manual_seed(0)))
-    axes = drawing(touch, sim, {"depth": depth.expand(2, 36)[..., None]}).axes[0]
+    figure = drawing(touch, sim, {"depth": depth.expand(2, 36)[..., None]})
+    title, facts, *_ = (text.get_text() for text in figure.texts)
+    counted = "36 of 36 taxels touched (above 1 µm)"
+    assert title == "depth"
+    assert facts.split("   ·   ") == ["contact_depth", "resolution med", counted, "depth max 3.6 mm", "environment 0"]
+    axes = figure.axes[0]
+    image = axes.images[0].get_array()
+    for border in (image[0], image[-1], image[:, 0], image[:, -1]):
+        assert (border == 1).all()  # nothing is cut off
     (dots,) = (part for part in axes.collections if part.get_array() is not None)
     order = depth.argsort().numpy()
     np.testing.assert_allclose(dots.get_array(), 1e3 * depth[order], rtol=1e-6)
+    assert dots.get_clim() == pytest.approx((0, 3.6))
     places = np.column_stack([touch.taxels["depth"]["pos"][order], np.ones(36)])
     pixels = np.asarray(dots.get_offsets())
     np.testing.assert_allclose(places @ np.linalg.lstsq(places, pixels, rcond=None)[0], pixels, atol=1e-6)
     assert np.ptp(pixels, axis=0).min() > 50
 
 
-def test_the_most_touched_link_has_the_first_map(touch, sim) -> None:
+def test_the_most_touched_link_has_the_first_map(touch, sim, small, monkeypatch) -> None:
     links = touch.taxels["touch"]["link"]
-    for first, second in (("pad", "side"), ("side", "pad")):
-        pressed = torch.from_numpy(np.where(links == first, 2.0, 0.01)).expand(2, -1)
-        axes = drawing(touch, sim, {"touch": pressed[..., None].expand(-1, -1, 6)}, reading="touch").axes
-        assert [each.get_label() for each in axes if each.get_label() in links] == [first, second]
+    for first, num in (("pad", 2), ("side", 1)):
+        monkeypatch.setattr("tgdsl.view.picture.MAX_MAPS", num)
+        force = torch.from_numpy(np.where(links == first, 2.0, 0.01)).expand(2, -1)[..., None].expand(-1, -1, 6)
+        figure = drawing(touch, sim, {"touch": force}, title="A pad")
+        maps = [axes.get_label() for axes in figure.axes if axes.get_label() in links]
+        names = [text for text in figure.axes[0].texts if text.get_text() in links]
+        assert maps == (["pad", "side"] if num > 1 else ["side"]) and {text.get_text() for text in names} == set(maps)
+        texts = [text.get_text() for text in figure.texts]
+        assert "A pad" in texts and any(text.startswith("touch   ·   kinematic_taxel   ·   ") for text in texts)
+        rest = [text for text in texts if "more links" in text]
+        assert rest == ([] if num > 1 else ["and 1 more links, touched less or not at all"])
+
+
+def test_names_of_links_at_one_place_do_not_cover_each_other() -> None:
+    viewport = Viewport(Camera(*np.eye(3), np.zeros(3)), np.zeros(2), 1000.0, 200, 100)
+    axes = new_figure(2, 1).add_subplot()
+    _draw_names(axes, viewport, {name: np.array([0.02, 0.05, 0.0]) for name in "abc"})
+    rows = [text.get_position()[1] for text in axes.texts]
+    assert rows[0] == pytest.approx(50) and np.diff(rows).min() > 2
+
+
+def test_maps_have_grey_cells_where_nothing_is_read_and_no_frame(touch, sim, small) -> None:
+    depth = torch.zeros(2, 36, 1, dtype=torch.float64)
+    figure = drawing(touch, sim, {"depth": depth})
+    assert "depth: nothing is touched" in [text.get_text() for text in figure.texts]
+    depth[:, 0] = 1e-3
+    _, pad, bar = drawing(touch, sim, {"depth": depth}).axes
+    assert bar.get_title() == "depth [mm]   (grey: up to 1 µm)" and bar.get_xlim() == (0, 1)
+    (cells,) = pad.collections
+    cells.update_scalarmappable()
+    is_grey = np.isclose(cells.get_facecolor()[:, :3], to_rgb(REST)).all(axis=1)
+    assert is_grey.sum() == 35 and pad.get_aspect() == pytest.approx(1)
+    assert not any(spine.get_visible() for spine in pad.spines.values())
+
+
+def test_objects_are_blue_before_the_robot_and_hidden_behind_it(touch, sim, readings) -> None:
+    """The cube on the pad covers 40 × 40 mm."""
+    for view, side in (("0,0", 0.04), ("180,0", 0.0)):
+        in_view = seen(touch, sim, markers(touch, sim, readings, "depth"), 0, 400, 400, view)
+        image = rendered(in_view).image
+        is_blue = image[..., 2] - image[..., 0] > 0.1
+        assert is_blue.sum() == pytest.approx((side * in_view.viewport.scale / 2) ** 2, rel=0.05)
 
 
 def test_paint_is_darkened_never_lightened(touch, sim, readings) -> None:
@@ -294,7 +349,7 @@ def test_a_jaw_with_its_origin_in_the_middle_points_away_from_its_mount(joint: s
 
 
 @pytest.mark.parametrize("along", [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
-def test_maps_have_the_distal_end_up_as_seen_from_outside(tmp_path: Path, along: list[int]) -> None:
+def test_maps_have_the_distal_end_up_as_seen_from_outside(tmp_path: Path, small: None, along: list[int]) -> None:
     """The finger runs along x, its taxels face z: the map's up is x and its right −y, for any direction of columns."""
     (tmp_path / "finger.xml").write_text(FINGER)
     grid = {"method": "grid", "rows": 3, "columns": 3, "direction": [0, 0, -1], "columns_along": along, "radius": 0.004}
@@ -316,6 +371,12 @@ def test_maps_have_the_distal_end_up_as_seen_from_outside(tmp_path: Path, along:
     sim = tgdsl.simulate(module, num_envs=1)
     figure = drawing(module, sim, {"depth": torch.tensor(value)[None, :, None]})
     maps = {axes.get_label(): axes for axes in figure.axes if axes.get_label() in ("palm", "near", "far")}
+    x, y, _ = np.ptp(table["pos"][table["link"] == "palm"], axis=0)
+    image = HeatMaps(sim.model, table).image(
+        np.where(table["link"] == "palm", 7, 9)[:, None].repeat(3, axis=1).astype(np.uint8)
+    )
+    high, wide = np.ptp(np.argwhere((image == 7).all(axis=2)), axis=0) + 1
+    assert maps["palm"].get_aspect() == pytest.approx(x / y) and high / wide == pytest.approx(x / y, rel=0.02)
     for name in ("palm", "far"):
         taxels = table["link"] == name
         order = np.lexsort((-table["pos"][taxels, 1].round(6), -table["pos"][taxels, 0].round(6)))
