@@ -1,6 +1,6 @@
 """Which tests are slow, and running the command line in the test's process.
 
-`make test` runs what is not marked `slow`; `make test-full` runs the rest, and some of the quick ones again with
+`make test` runs the tests that are not marked `slow`; `make test-full` runs the rest, and some of the quick ones again with
 `--check-types`: jaxtyping and beartype then check types and shapes at every call.
 """
 

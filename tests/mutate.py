@@ -87,7 +87,7 @@ class Sites(ast.NodeVisitor):
         self._statement: ast.stmt | None = None
 
     def visit(self, node: ast.AST) -> None:
-        """Collect a node and what is below it."""
+        """Collect a node and its descendants."""
         skipped = ast.Raise | ast.Assert | ast.JoinedStr | ast.Import | ast.ImportFrom | ast.arg
         is_strict = isinstance(node, ast.keyword) and node.arg == "strict"
         if isinstance(node, skipped) or is_strict or _is_kernel(node) or _is_guard(node) or _is_docstring(node):

@@ -1,4 +1,4 @@
-"""Calls with something else than what is expected: each is told what it is, and what to do."""
+"""Calls with an argument of the wrong type: each error names the type and the remedy."""
 
 from contextlib import closing
 from pathlib import Path

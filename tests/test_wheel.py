@@ -66,7 +66,7 @@ def test_a_robot_of_the_wheel_compiles_and_runs(wheel, version, tmp_path):
     commands = tmp_path / "venv" / "bin"
     pip = [commands / "pip", "install", "--quiet", "--no-compile", "-c", REPOSITORY / "constraints.txt", wheel]
     if sys.version.startswith(f"{version}.") and all(map(python_of, VERSIONS)):
-        # The environment of the other version shows that what the wheel requires is enough; this one shares what is here.
+        # The environment of the other version shows that the wheel's requirements are enough; this one shares the packages installed here.
         (site,) = (tmp_path / "venv").glob("lib/python*/site-packages")
         (site / "installed.pth").write_text(sysconfig.get_path("purelib"))
         pip[2:3] = ["--quiet", "--no-deps", "--force-reinstall"]

@@ -1,4 +1,4 @@
-"""Wrong arguments: each ends in an error of ours that says what was found and what would be right.
+"""Wrong arguments: each raises one of our errors, which names the value found and the one expected.
 
 Types are not checked at run time here, as on a user's computer.
 """
@@ -169,7 +169,7 @@ def test_a_wrong_argument_is_named(touch, folder, call, kind, message):
     assert type(caught.value) is kind and str(caught.value).startswith(message)
 
 
-# What was refused with no reason is taken
+# Arguments that were refused without a reason are accepted
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import tgdsl
 from tgdsl.module.module import TactileModule
 
 TOLERANCE = 1e-12
-"""Both sides are float64 and the same solver; what is left is the order of a few sums and products."""
+"""Both sides use float64 and the same solver, and differ in the order of a few sums and products."""
 CONTACT_FIELDS = ("contact_found", "contact_pos", "contact_force", "contact_torque", "contact_normal", "contact_netforce")
 WEIGHT = 0.25 * 9.81
 PAD = """

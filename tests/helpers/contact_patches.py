@@ -58,7 +58,7 @@ def arguments(name: str, dtype: torch.dtype, num_envs: int = NUM_ENVS) -> tuple:
     torque = 0.01 * rng.normal(size=(*shape, 3))
     whole = (force * is_used[..., None]).sum(axis=2) + 0.1 * rng.normal(size=(*shape[:2], 3)) * is_used.any(axis=2)[..., None]
     whole[0] = (force * is_used[..., None]).sum(axis=2)[0]
-    pos[4, :, 0] += np.where(is_used[4, :, :1], 0.0, np.nan)  # what is not used means nothing
+    pos[4, :, 0] += np.where(is_used[4, :, :1], 0.0, np.nan)  # unused slots hold arbitrary numbers
     quat = rng.normal(size=(num_envs, case.bodies + 1, 4))
     bodies = rng.permutation(case.bodies + 1)[: case.bodies]
 

@@ -1,4 +1,4 @@
-"""A small document and its layout, and what is said about wrong ones."""
+"""A small document and its layout, and the errors of wrong ones."""
 
 from collections.abc import Mapping
 from pathlib import Path

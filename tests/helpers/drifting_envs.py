@@ -6,7 +6,7 @@ from tensordict import TensorDict
 
 
 class Drifting(VecEnv):
-    """What is observed is position, velocity and something that hardly changes; to be near the origin pays."""
+    """Observations are position, velocity and a number that hardly changes; the reward is for being near the origin."""
 
     num_actions, max_episode_length, device, cfg, step_dt = 2, 7, "cpu", {}, 0.025
 

@@ -12,7 +12,7 @@ from tgdsl.runtime.xhand1.calibration import Calibration
 
 ORDER = [str(name) for name in np.random.default_rng(1).permutation(JOINTS)]
 """Of the actuators: neither the hand's nor the model's."""
-PRESS = '''"""Bend the joints until their sum is what is asked for."""
+PRESS = '''"""Bend the joints until their sum is the commanded one."""
 
 import torch
 
@@ -105,7 +105,7 @@ def press_task(folder: Path, side: str = "right", **sensors) -> Path:
 
 
 class Blind(torch.nn.Module):
-    """Actions that follow from what is asked for and the last action alone, so that nothing that is felt comes back."""
+    """Actions that follow from the command and the last action alone, so that touch has no effect on them."""
 
     def __init__(self, actions: int):
         super().__init__()
@@ -118,7 +118,7 @@ class Blind(torch.nn.Module):
 
 
 def press_policy(folder: Path, task: Path, module=None, name: str = "student.pt", **overrides) -> Path:
-    """Write a policy that sees `proprio`, what is felt and `goal`; return its file."""
+    """Write a policy that sees `proprio`, touch and `goal`; return its file."""
     from written_teachers import teacher
 
     loaded = load_task(task, overrides)

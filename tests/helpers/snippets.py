@@ -1,4 +1,4 @@
-"""Blocks of code in Markdown pages, and what is run or checked of each.
+"""Blocks of code in Markdown pages, and which of them run or are checked.
 
 A comment before a block directs it: `<!-- snippet: parse, WHY -->` (not run), `slow`, `file NAME` (written to the page's folder),
 `with CODE` (Python that is run before it; a page need not show it).
@@ -96,7 +96,7 @@ def parse(arguments: list[str]) -> None:
 
 
 def check_other(words: list[str]) -> None:
-    """Check a command line that does not call tgdsl: targets, scripts and extras exist; what is none of these is an error."""
+    """Check a command line that does not call tgdsl: targets, scripts and extras exist; anything else is an error."""
     if words[0] == "make":
         makefile = (REPOSITORY / "Makefile").read_text(encoding="utf-8")
         for target in words[1:]:

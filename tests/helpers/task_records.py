@@ -102,7 +102,7 @@ def reference_rates(task, reference, spec, record: Record, dt: float) -> Record:
 
 
 def assert_reference(recorder: Recorder, reference, tolerance: float = 1e-6) -> set[str]:
-    """Compare rewards, ends and scores of all episodes with a task's reference; return what was ever different from 0."""
+    """Compare rewards, ends and scores of all episodes with a task's reference; return the terms that ever differed from 0."""
     seen: set[str] = set()
     for record, rows in recorder.records():
         env = recorder.env

@@ -58,7 +58,7 @@ def parts(*names, kind="body"):
 
 
 def hand(welded="body", more="", **parts):
-    """Return the hand with the item pressed 1 mm into the finger's core; what is welded to that is a body, or a frame."""
+    """Return the hand with the item pressed 1 mm into the finger's core; a body, or a frame, is welded to it."""
 
     def text(pos=(0, 0, 0), quat=(1, 0, 0, 0)):
         own = {**NAMES, **JOINTS, **parts, "pos": " ".join(map(repr, pos)), "quat": " ".join(map(repr, quat))}

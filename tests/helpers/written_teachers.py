@@ -24,7 +24,7 @@ class FindRidge(torch.nn.Module):
 
 
 class Linear(torch.nn.Module):
-    """A fixed linear function of what is seen."""
+    """A fixed linear function of the observations."""
 
     def __init__(self, size: int, actions: int):
         super().__init__()

@@ -101,7 +101,7 @@ def read_again(hand: XHand1) -> Reading:
 
 
 def drive_until(hand: XHand1, target: np.ndarray, is_so: Callable[[], bool]) -> None:
-    """Command until something is so; what was stopped, as the machine stood still, is begun again."""
+    """Command until a condition holds; a hand that stopped because the machine stood still is started again."""
 
     def commanded() -> bool:
         try:

@@ -150,7 +150,7 @@ def _cylinder_points(size: np.ndarray, rng: np.random.Generator, num: int) -> Su
 
 @oracle(
     "{num:,} points at known distances of a {shape}, size {size}", "φ(X + t n) = t, ∇φ = n",
-    "X + t n is at t while X is the nearest point", "largest error over what is allowed [1]",
+    "X + t n is at t while X is the nearest point", "largest error over the tolerance [1]",
     at=["φ, 1e-12 of the size", "|∇φ|, 1e-5", "φ in float32, 1e-6", "|∇φ| in float32, 1e-5", "∇φ, 1e-8"], atol=1.0,
     defects=(7,), each=[(*row, 20_000) for row in PRIMITIVES], also=[(*row, 1_000_000) for row in PRIMITIVES],
 )  # fmt: skip

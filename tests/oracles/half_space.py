@@ -97,7 +97,7 @@ def far_field(nu: float = 0.48):
 
 @oracle(
     "Navier: equilibrium below a patch of {patch:mm}, load {load}", "∇²u + ∇(∇·u)/(1−2ν) = 0",
-    "Johnson 1985, 3.1; central differences of steps h", "what is left at h/2 over that at h [1]", at=["h = 0.1 mm"], atol=0.03,
+    "Johnson 1985, 3.1; central differences of steps h", "error at h/2 over the error at h [1]", at=["h = 0.1 mm"], atol=0.03,
     each=[(0.0, OBLIQUE), (1e-3, OBLIQUE)], also=product((0.0, 1e-3), (NORMAL, TANGENTIAL)),
 )  # fmt: skip
 def equilibrium(patch: float, load: Load, nu: float = 0.3):

@@ -143,7 +143,7 @@ def plane_integral(heights: tuple[float, ...] = (0.0, 0.003, -0.003, 0.0099, 0.0
 
 @oracle(
     "Moments of a {solid}", "S0, S1", "one-dimensional quadrature over the ball; midpoint sums over the box's faces",
-    "RMS error over full scale, over what is allowed [1]",
+    "RMS error over full scale, over the tolerance [1]",
     at=["S0 of sums", "S1 of sums", "S0 of the field", "S1 of the field"], atol=1.0, each=["ball", "box"], slow=True,
 )  # fmt: skip
 def solid_moments(solid: str):
@@ -196,7 +196,7 @@ AREAS: dict[str, tuple[list[float], float]] = {
 
 @field("proximity", "proximity", "geometry")(
     "Areas of primitives", "A", "geometry; an ellipsoid by quadrature, one of revolution in closed form",
-    "area over the exact one, off 1 over what is allowed [1]", atol=1.0,
+    "area over the exact one, off 1 over the tolerance [1]", atol=1.0,
 )  # fmt: skip
 def areas(names: Sequence[str] = tuple(AREAS)):
     ours = [surface_area([geom_of(name.split()[0].rstrip(","), AREAS[name][0], pos=(0.1, -0.2, 0.3))]) for name in names]

@@ -69,7 +69,7 @@ def sheet_of(name: str, results: Results) -> Sheet:
         Section(title, tuple(map(entry, computed)), tuple(left_out)) for title, (computed, left_out) in results.items()
     )
     if name == "oracles":
-        return Sheet(name, "tgdsl against what is known", ABOUT, HEADER, sections)
+        return Sheet(name, "tgdsl against known results", ABOUT, HEADER, sections)
     return Sheet(name, "numerical hard cases of tgdsl", HARD_ABOUT, HARD_HEADER, sections)
 
 

@@ -129,7 +129,7 @@ def _findings(sheet: Sheet) -> str:
         (f"{defect.number}. {defect.about}", defect.measured, title or f"tgdsl bench --{defect.answered_in}", figure)
         for defect, title, figure in findings(sheet.entries)
     ]
-    about = "What was measured on, or read from, the paper's published implementation (Chung et al.), and what answers it here."
+    about = "Measurements and settings of the paper's published implementation (Chung et al.), and their counterparts here."
     table = table_of(("finding", "there", "answered by", "figure here"), rows)
     return f'<section id="findings"><h2>Findings</h2><p>{about}</p>\n{table}</section>'
 

@@ -1,4 +1,4 @@
-"""Logs are read back bit for bit, or an error says what is wrong with the file."""
+"""Logs are read back bit for bit, or an error names the fault in the file."""
 
 import json
 import tracemalloc
