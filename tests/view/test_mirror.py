@@ -46,7 +46,9 @@ def test_a_mirror_has_the_poses_and_readings_of_the_requested_environment(docume
     lift = np.array([[0.0], [0.01], [-0.002]])
     sim.reset(qpos=lift)
     stage = SimStage(touch, sim)
+    assert stage.time == 0
     stage.update(touch(sim.state()))
+    assert stage.time == stage.control_step
     (requests, request_pipe), (frames, frame_pipe) = (map(open, os.pipe(), ("rb", "wb")) for _ in range(2))
     opening = mirror._Opening(mirror._tables(touch), stage.model, 3, mirror.frame_of(stage, 0, b""), "127.0.0.1", 0)
     copy = MirrorStage(pickle.loads(pickle.dumps(opening)), frames, request_pipe)
@@ -126,6 +128,8 @@ def test_a_loops_page_shows_its_frames_and_ends_with_its_process(document, capsy
         assert sends(2)
         page._process.send_signal(signal.SIGINT)  # as Ctrl-C does, for both processes of a terminal
         assert sends(10)
+        assert os.getpriority(os.PRIO_PROCESS, page._process.pid) == os.getpriority(os.PRIO_PROCESS, 0) + mirror.PRIORITY
+        assert page._thread.daemon  # the loop's process ends without `close`
     page.close()
     assert capsys.readouterr().err == ""
     assert page._process.returncode is not None

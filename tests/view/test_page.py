@@ -43,7 +43,7 @@ from tgdsl.view.live_scene import ARROW
 from tgdsl.view.meshes import body_surfaces
 from tgdsl.view.page import MAX_STEPS, Page
 from tgdsl.view.picture import HeatMaps
-from tgdsl.view.stages import RunStage, SceneStage, Stage
+from tgdsl.view.stages import RunStage, SceneStage, Stage, contacts_of
 from tgdsl.view.style import LIVE_OBJECT, LIVE_OTHER, LIVE_REST, LIVE_SENSING
 
 ROOT = Path(__file__).parents[2]
@@ -122,6 +122,25 @@ def test_a_slider_moves_its_actuator_and_a_keyframe_moves_the_sliders(document):
         page.panel.keyframe.value = "up"
         assert soon(lambda: (page.run(seconds=0.2), page.stage.body_poses(0)[0][2, 2] > low + 0.004)[1])
         assert page.panel.sliders[0].value == pytest.approx(0.01)
+
+
+def test_sliders_have_the_names_and_ranges_of_actuators_and_begin_at_the_keyframe_of_the_initial_pose(tmp_path):
+    keys = '<key name="up" qpos="0.01" ctrl="0.01 0"/><key qpos="0.01" ctrl="0 0"/><key name="rest" qpos="0" ctrl="0.005 0.2"/>'
+    scene = re.sub("<key name.*/>", keys, SCENE).replace("</actuator>", '<motor joint="lift"/></actuator>')
+    (tmp_path / "press.xml").write_text(scene)
+    (tmp_path / "press.yaml").write_text(WITHOUT_PROXIMITY)
+    with opened(SceneStage(tgdsl.compile(tmp_path / "press.yaml"))) as page:
+        sliders = page.panel.sliders
+        assert page.stage.sliders == [("lift", -0.02, 0.02), ("actuator 1", -1.0, 1.0)]
+        assert [(slider.min, slider.max, slider.value) for slider in sliders] == [(-0.02, 0.02, 0.005), (-1.0, 1.0, 0.2)]
+        assert page.panel.keyframe.options == ("", "up", "rest")
+        page.panel.keyframe.value = "up"
+        page._react()
+        page._step_once()
+        assert [slider.value for slider in sliders] == [0.01, 0.0] == page.stage.control.tolist()
+        page._restart()
+        assert [slider.value for slider in sliders] == [0.005, 0.2] and page.stage.time == 0
+        assert page.stage.body_poses(0)[0][2, 2] == pytest.approx(0.0749)
 
 
 def test_another_reading_has_its_own_channels(document):
@@ -224,7 +243,16 @@ def test_a_recorded_run_has_mujocos_poses(document, recording):
     stage.seek(7)
     np.testing.assert_allclose(stage.body_poses(0)[0], data.xpos, atol=1e-12)
     assert np.array_equal(stage.readings["touch"].numpy(), readings[7])
+    for step, expected in ((-1, 0), (99, len(readings) - 1)):
+        stage.seek(step)
+        assert stage.step_index == expected and stage.time == pytest.approx((expected + 1) * stage.control_step)
+    stage.advance()
+    assert stage.step_index == len(readings) - 1
+    stage.restart()
+    assert stage.step_index == 0
     with opened(stage) as page:
+        assert page.panel.status.content == f"t = {stage.control_step:.2f} s · 16 taxels · 0 contacts"
+        assert stage.contacts(0).force is None  # it is not recorded
         assert (page.panel.instant.min, page.panel.instant.max) == (0, len(readings) - 1)
         page.panel.instant.value = 3
         page._react()
@@ -391,6 +419,15 @@ def test_the_contact_is_below_the_ball_and_balances_weight_and_actuator(document
     stage.close()
 
 
+def test_a_contact_in_a_gap_is_none():
+    text = "<mujoco><worldbody><geom type='plane' size='1 1 1'/>{}</worldbody></mujoco>"
+    for zone, num in (("margin='.01'", 1), ("gap='.01'", 0)):
+        model = mujoco.MjModel.from_xml_string(text.format(f"<body pos='0 0 .105'><freejoint/><geom size='.1' {zone}/></body>"))
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        assert data.ncon == 1 and len(contacts_of(model, data).pos) == num
+
+
 def test_contacts_are_drawn_and_can_be_switched_off(document):
     with opened(SceneStage(tgdsl.compile(document))) as page:
         for _ in range(100):
@@ -536,6 +573,23 @@ def test_objects_have_the_colours_of_their_materials():
     assert orange == pytest.approx((0.8, 0.4, 0, 0.5), abs=0.005)
     assert green == (0, 1, 0, 1)
     assert none is None
+
+
+def test_meshes_that_collide_with_anything_are_drawn_and_visual_ones_are_not():
+    """Two tetrahedra with edges along the axes of the body, and a large visual sphere."""
+    text = """<mujoco><asset><mesh name="a" vertex="0 0 0 1 0 0 0 1 0 0 0 1" smoothnormal="true"/>
+    <mesh name="b" vertex="0 0 0 0 0 4 0 3 0 2 0 0" smoothnormal="true"/>
+    </asset><worldbody><body><geom type="mesh" mesh="a" contype="0" rgba="1 0 0 1"/>
+    <geom type="mesh" mesh="b" conaffinity="0" rgba="0 1 0 1"/><geom size="9" contype="0" conaffinity="0"/></body></worldbody></mujoco>"""
+    red, green = body_surfaces(mujoco.MjModel.from_xml_string(text), 1)
+    for surface, ends, colour in ((red, (1, 1, 1), (1, 0, 0, 1)), (green, (2, 3, 4), (0, 1, 0, 1))):
+        corners = surface.corners.reshape(-1, 3)
+        np.testing.assert_allclose([corners.min(axis=0), corners.max(axis=0)], [(0, 0, 0), ends], atol=1e-6)
+        assert surface.colour == colour and len(surface.corners) == 4
+        sides = np.cross(surface.corners[:, 1] - surface.corners[:, 0], surface.corners[:, 2] - surface.corners[:, 0])
+        outward = surface.corners.mean(axis=1) - np.array(ends) / 4
+        assert ((sides * outward).sum(axis=1) > 0).all()
+        assert ((surface.normals * (surface.corners - np.array(ends) / 4)).sum(axis=2) > 0).all()
 
 
 def test_another_environment_shows_its_own_object(document):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from tgdsl.view.sound import PEAK, RollingSound, Sound, draw, spectrogram, write_wav
+from tgdsl.view.sound import PEAK, RANGE, RollingSound, Sound, draw, spectrogram, write_wav
 
 RATE = 8000.0
 
@@ -54,6 +54,25 @@ def test_a_sound_shorter_than_a_window_has_one_window(tmp_path):
     assert (tmp_path / "two.png").stat().st_size > 1000
 
 
+def test_a_picture_has_a_spectrogram_for_each_sound_and_marks(monkeypatch, tmp_path):
+    figures = []
+    monkeypatch.setattr("tgdsl.view.sound.save_figure", lambda figure, path: figures.append(figure))
+    draw([decaying((440.0, 5.0)), Sound("nothing", "Pa", RATE, np.zeros(8000))], tmp_path / "x.png", "two", {"bell": [440.0]})
+    (figure,) = figures
+    bell, nothing, bar = figure.axes
+    assert figure.get_suptitle() == "two"
+    assert (bell.get_ylabel(), nothing.get_ylabel()) == ("bell\n[kHz]", "nothing\n[kHz]")
+    assert (bell.get_xlabel(), nothing.get_xlabel()) == ("", "time [s]") and bell.get_xlim() == (0, 1)
+    (image,), (mark,) = bell.collections, bell.lines
+    level, places = image.get_array(), image.get_coordinates()
+    row, column = np.unravel_index(level.argmax(), level.shape)
+    assert places[row, 0, 1] <= 0.44 <= places[row + 1, 0, 1]
+    assert 0.48 < places[0, column, 0] < 0.52  # half a second of silence comes first
+    assert mark.get_ydata() == [0.44] and not nothing.lines
+    assert (nothing.collections[0].get_array() == -RANGE).all()
+    assert bar.get_ylabel() == "power, of the loudest [dB]" and bar.get_ylim() == (-RANGE, 0)
+
+
 def test_a_rolling_sound_keeps_its_last_seconds_and_restarts_after_a_gap():
     rate, step, frequency = 8000.0, 0.01, 1000.0
     rolling = RollingSound("hum", "m/s", 0.5)
@@ -61,6 +80,9 @@ def test_a_rolling_sound_keeps_its_last_seconds_and_restarts_after_a_gap():
     for i in range(200):
         time = (i * num + np.arange(num)) / rate
         rolling.add(np.sin(2 * np.pi * frequency * time), (i + 1) * step, step)
+        if i == 24:  # half of the time that it keeps
+            loud = rolling.image(64, 50).astype(int).sum(axis=2).max(axis=0)
+            assert (loud[:24] == loud[0]).all() and loud[26:].min() > 2 * loud[0]
     assert len(rolling.sound.samples) == 0.5 * rate
     image = rolling.image(64, 50).astype(int).sum(axis=2)
     assert abs(image[:, 25].argmax() - 64 * (1 - frequency / (rate / 2))) <= 1  # the bright row: 1 kHz of 4, from below
