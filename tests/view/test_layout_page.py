@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from box_hands import BOX_HAND
+from box_hands import BOX_HAND, TIP_AREA
 from odd_hands import command
 
 from tgdsl.formats.robot import load_model
@@ -35,8 +35,11 @@ def test_controls_change_the_chosen_links_and_the_button_writes_the_commands_fil
         before = {name: handle for name, (_, handle) in page._discs.items()}
         page.chosen.value = "(tips)"
         page.react()
+        assert page.density.value == 4.0
         page.density.value = 10.0
-        page.react()
+        page.run(seconds=1e-3)
+        area = 2 * TIP_AREA / 100
+        assert page.status.content.endswith(f" at med, {round(10 * area)} of them on the chosen {area:.3g} cm²")
         assert {name: num for name, num in discs(page).items() if "tip" in name} == {"left_tip": 48, "right_tip": 48}
         assert page._discs["palm"][1] is before["palm"]  # unchanged links are not drawn again
         assert {tuple(page._discs[name][1].batched_colors[0]) for name in ("left", "left_tip")} == {LIVE_REST, CHOSEN}
@@ -61,6 +64,14 @@ def test_discs_are_polygons_of_16_corners(tmp_path):
     np.testing.assert_allclose(normals[:, 2], np.sin(2 * np.pi / 16), atol=1e-6)  # twice the area of each of 16 triangles
 
 
+def test_the_camera_looks_at_the_hand_whose_bodies_are_where_the_model_has_them(tmp_path):
+    with opened(tmp_path) as page:
+        np.testing.assert_allclose(page._frames["left_tip"].position, [-0.03, 0, 0.014 + 0.032], atol=1e-9)
+        camera = page.server.initial_camera
+        np.testing.assert_allclose(camera.look_at, [0, 0, 0.04], atol=0.02)  # the middle of the hand
+        assert 0.1 < np.linalg.norm(np.asarray(camera.position) - camera.look_at) < 0.3
+
+
 def test_side_box_and_resolution_move_the_taxels(tmp_path, clicks):
     with opened(tmp_path) as page:
         tip = page.draft.robot.compiled.body("left_tip").id
@@ -68,7 +79,11 @@ def test_side_box_and_resolution_move_the_taxels(tmp_path, clicks):
             clicks[f"/body{tip}/{node}"](None)
             page.react()
             assert page.chosen.value == chosen
-        assert page.side.value == "+x" and page._frames["left_tip"].show_axes
+        assert page.side.value == "+x"
+        assert [name for name, frame in page._frames.items() if frame.show_axes] == ["left_tip"]
+        assert page.side.options == (ALL_AROUND, "+x", "-x", "+y", "-y", "+z", "-z")
+        ends = [(least, most, *slider.value) for slider, least, most in page._bounds]
+        np.testing.assert_allclose(ends, [2 * (-6, 6), 2 * (-9, 9), 2 * (0, 32)], atol=0.05)  # the geom's with room of 1 mm
         page.side.value = "-y"
         page.react()
         handle = page._discs["left_tip"][1]
@@ -97,6 +112,8 @@ def test_side_box_and_resolution_move_the_taxels(tmp_path, clicks):
 
 def test_links_can_leave_and_join_groups(tmp_path):
     with opened(tmp_path) as page:
+        chosen = {group: {name for name, box in boxes.items() if box.value} for group, boxes in page.members.items()}
+        assert chosen["tips"] == {"left_tip", "right_tip"} and chosen["palm"] == {"palm"}
         page.members["tips"]["left_tip"].value = False
         page.members["tips"]["palm"].value = True
         page.members["palm"]["palm"].value = False

@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 import pytest
+import viser
 import yaml
 from box_hands import BOX_HAND
 from faulty_lines import FaultyEmulator
@@ -34,7 +35,7 @@ from tgdsl.runtime.xhand1.driver import Reading, XHand1
 from tgdsl.runtime.xhand1.emulator.emulator import TipForces
 from tgdsl.runtime.xhand1.log.log import Fault
 from tgdsl.runtime.xhand1.observe import TIP_BODIES
-from tgdsl.runtime.xhand1.wire.protocol import JOINTS, STATE_SIZE, decode_state
+from tgdsl.runtime.xhand1.wire.protocol import FINGERS, JOINTS, STATE_SIZE, decode_state
 from tgdsl.scene.scene import scene_model
 from tgdsl.schema.load import load_layout
 from tgdsl.view.hand_stage import HandLogStage, LiveHandStage
@@ -158,10 +159,12 @@ def test_another_reading_has_its_own_channels(document):
         assert page.panel.channel.value == "magnitude"
 
 
-def test_a_page_is_served_only_locally_by_default(document):
-    touch = tgdsl.compile(document)
+def test_a_page_is_served_only_locally_by_default(document, monkeypatch):
+    touch, themes = tgdsl.compile(document), []
+    monkeypatch.setattr(viser.GuiApi, "configure_theme", lambda gui, **options: themes.append(options))
     with opened(SceneStage(touch)) as page, pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.2", page.server.get_port()))
+    assert themes == [{"show_share_button": False}]  # which would open a tunnel from the internet
     with pytest.warns(match=r"served at 0\.0\.0\.0: whoever reaches this machine"):
         page = Page(SceneStage(touch), "0.0.0.0", port=8300)
     socket.create_connection(("127.0.0.2", page.server.get_port())).close()
@@ -211,8 +214,10 @@ def test_a_scene_runs_in_real_time_times_the_speed(document, monkeypatch):
             page.run(watch, seconds)
             return len(starts), page.stage.time - before
 
+        images = list[float]()
+        monkeypatch.setattr(page, "_draw_images", lambda *_: images.append(clock.now))
         frames, elapsed = run(0.7)
-        assert frames == pytest.approx(30 * 0.7, abs=1)
+        assert frames == pytest.approx(30 * 0.7, abs=1) and len(images) == pytest.approx(10 * 0.7, abs=1)
         assert 0.65 < elapsed <= 0.7  # the first frame has no step
         page.panel.speed.value = 0.5
         assert run(0.7)[1] == pytest.approx(0.35, abs=0.03)
@@ -507,6 +512,9 @@ def test_parts_links_groups_and_sensors_can_be_switched_on_and_off(tmp_path):
         page.panel.links["pad"].value = False
         assert visible_links() == {"side"}
         assert page.panel.value.content == "**sum**: |force| 0 N"  # the ball lies on the other link
+        page.panel.links["pad"].value, page.panel.links["side"].value = True, False
+        assert visible_links() == {"pad"}
+        assert not page.panel.value.content.endswith(" 0 N")
         page.panel.group.value = "one"
         page.panel.links["pad"].value = True
         assert visible_links() == {"side"}
@@ -776,8 +784,10 @@ def test_a_hands_log_has_its_angles_and_forces(tmp_path):
     path, position, counts = hand_log(tmp_path / "log.npz")
     stage = View(path)._stage()
     assert isinstance(stage, HandLogStage)
-    assert stage.num_steps == 5
-    stage.seek(2)
+    assert stage.num_steps == 5 and stage.control_step == pytest.approx(0.01)
+    for step, expected in ((-1, 0), (99, 4), (2, 2)):
+        stage.seek(step)
+        assert stage.step_index == expected and stage.time == pytest.approx(0.01 * expected)
     model = stage.model
     data = mujoco.MjData(model)
     for joint, angle in zip(JOINTS, position[2].astype(np.float32), strict=True):
@@ -828,8 +838,16 @@ def test_an_emulated_hand_is_shown_and_its_unplugging_noted():
             stage.advance()
             page.draw()
             assert "13 counts" in page.panel.value.content
+            assert stage.time > 0
+            stage.restart()
+            assert stage.time == 0
+            stage.advance()
+            assert stage.time < 10.0
+            names = [f"{name} [°C]" for name in FINGERS]
+            assert list(stage.notes(0)) == ["failures", "joints with errors", *names] and stage.notes(0)["failures"] == 0
+            assert page.panel.notes.content.splitlines()[2:4] == ["| failures | 0 |", "| joints with errors | 0 |"]
             emulator.unplug()
-            assert soon(lambda: (stage.advance(), "NO NEW READING" in stage.notes(0))[1])
+            assert soon(lambda: (stage.advance(), "NO NEW READING" in stage.notes(0))[1]) and stage.notes(0)["failures"] > 0
             emulator.replug()
             assert soon(lambda: (stage.advance(), "NO NEW READING" not in stage.notes(0))[1])
 

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 
 import tgdsl
 from tgdsl.compiler.pipeline import placed
@@ -109,6 +110,9 @@ def test_discs_are_at_the_taxels(hand: Drawn, view: str, keyframe: str | None) -
         expected = bounds.mean(axis=1) + scale * offsets
         order, expected_order = (np.lexsort(points.round(3).T) for points in (centres, expected))
         np.testing.assert_allclose(centres[order], expected[expected_order], atol=1e-6)
+        for bar, length in zip(axes.lines, axes.texts, strict=True):
+            assert np.ptp(bar.get_xdata()) == pytest.approx(1e-3 * int(length.get_text().removesuffix(" mm")) * scale)
+    assert [len(axes.lines) for axes in figure.axes] == [1, 0]
 
 
 @pytest.mark.slow
@@ -222,10 +226,13 @@ def test_a_link_has_the_colour_of_its_smallest_group(hand: Drawn) -> None:
     assert group_of(layouts["few"]) == ["all", "tips"]
     assert legend(layouts["few"]) == {"other all": 4, "tips": 6}
     assert legend(layouts["many"]) == {"other all": 36, "tips": 2}  # fillers do not count
-    parts = {part.get_gid(): part for part in drawing(*hand, size=SMALL).axes[0].collections}
+    figure = drawing(*hand, size=SMALL)
+    parts = {part.get_gid(): part for part in figure.axes[0].collections}
     colours = np.concatenate([parts["hidden"].get_edgecolor(), parts["shown"].get_facecolor()])[:, :3]
     hues = {tuple(hue) for hue in (colours / colours.max(axis=1, keepdims=True)).round(6)}  # shaded discs keep theirs
     assert len(hues) == 2
+    marks = np.array([to_rgb(handle.get_color()) for handle in figure.axes[0].get_legend().legend_handles])
+    assert {tuple(hue) for hue in (marks / marks.max(axis=1, keepdims=True)).round(6)} == hues
 
 
 def test_legend_without_groups() -> None:
@@ -259,6 +266,35 @@ def test_a_picture_is_as_high_as_the_command_says(hand: Drawn) -> None:
     """`tgdsl render --help`: by default 750 pixels."""
     figure = drawing(hand[0], {"few": hand[1]["few"]})
     assert figure.get_figheight() * figure.dpi == pytest.approx(750)
+
+
+def test_panels_are_side_by_side_and_as_wide_as_the_hand_needs(hand: Drawn, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tgdsl.view.render.HEIGHT", 250)  # fewer pixels take less time
+    left, right = drawing(*hand, view="top").axes
+    for axes in (left, right):
+        is_hand = (axes.images[0].get_array() < 0.995).any(axis=2)
+        for axis in (0, 1):
+            drawn = np.flatnonzero(is_hand.any(axis=axis)) / is_hand.shape[1 - axis]
+            assert 0 < drawn[0] < 0.03 and 0.97 < drawn[-1] < 1
+    left, right = left.get_position(), right.get_position()
+    assert 0 < left.x0 < left.x1 < right.x0 < right.x1 < 1 and left.width == pytest.approx(right.width)
+    assert left.x0 == pytest.approx(1 - right.x1, abs=0.01)
+
+
+def test_a_hollow_is_darker_than_the_surface_around_it() -> None:
+    """A plate with a block of 2 cm on it: beside the block, and 3 cm from it."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body name="palm"><geom type="box" size=".05 .05 .005"/>
+        <geom type="box" size=".01 .01 .01" pos="0 0 .01"/></body></worldbody></mujoco>"""
+    )
+    (axes,) = drawing(model, {"x": one_link([[0, 0, 0.02]], [[0, 0, 1]])}, view="0,0", size=(300, 300)).axes
+    image = axes.images[0].get_array()[..., 0]
+    row = image[len(image) // 2]
+    left, right = np.flatnonzero(row < 0.995)[[0, -1]]
+    for side in (-1, 1):
+        beside, away = (row[round((left + right) / 2 + side * x / 0.1 * (right - left))] for x in (0.013, 0.04))
+        assert beside < away - 0.02
+        assert away == pytest.approx(row[round((left + right) / 2)], abs=0.03)  # the block's top, which lies in no hollow
 
 
 def test_the_hand_fills_a_panel_of_the_given_size(hand: Drawn, tmp_path: Path) -> None:

@@ -117,15 +117,20 @@ def test_a_readings_age_counts_until_now(capsys):
 
 def test_a_hands_table_has_forces_with_bars_and_joints_with_errors(capsys):
     force, error = np.zeros((5, 3), np.int16), np.zeros((12, 3), np.uint16)
-    force[1], force[3], error[2, 1] = (3, 4, 12), (0, 0, 300), 0x21
+    taxels = np.zeros((5, 120, 3), np.int16)
+    force[1], force[3], error[2, 1], taxels[3, 7] = (3, 4, 12), (0, 0, 300), 0x21, (0, -130, 0)
+    parts = {"joint_temperature": np.full(12, 0x0123), "current": np.arange(12), "taxel_force": taxels}
     position = np.linspace(0, 1.1, 12).astype(np.float32)
-    lines = hand_lines(capsys, reading_at(0.0, total_force=force, joint_error=error, position=position), now=0.0)
+    parts |= {"total_force": force, "joint_error": error, "position": position, "total_temperature": np.arange(31, 36)}
+    lines = hand_lines(capsys, reading_at(0.0, **parts), now=0.0)
     rows = [line.split() for line in lines]
     index = rows[5]
-    assert index[:5] == ["index", "3.00", "4.00", "12.00", "13.00"]
+    assert index[:6] == ["index", "3.00", "4.00", "12.00", "13.00", "32"]
     eighths = 8 * index[6].count("█") + " ▏▎▍▌▋▊▉".find(index[6][-1])
     assert eighths == round(8 * 32 * 13 / 255)
-    assert rows[7][6] == 32 * "█"  # 300 is beyond a full bar
+    assert lines[7].endswith(32 * "█" + " SATURATED, 1 taxels saturated")  # 300 is beyond a full bar
+    assert not any("saturated" in line.lower() for line in lines[4:7])
     joints = rows[-12:]
     np.testing.assert_allclose([float(row[-4]) for row in joints if row[-1] == "–"], np.delete(position, 2), atol=5e-4)
+    assert [row[-3:-1] for row in joints if row[-1] == "–"] == [[str(i), "35"] for i in range(12) if i != 2]  # 0x23 °C
     assert joints[2][-3:] == ["0x0000", "0x0021", "0x0000"]

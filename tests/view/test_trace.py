@@ -72,6 +72,9 @@ def test_spheres_are_at_the_taxels_in_the_colours_of_their_readings(touch, trace
     sizes = [[0, 0, 0], [5, 1, 2], [0, 5, 0]][step]
     for sphere, size in zip(spheres, sizes, strict=True):
         np.testing.assert_allclose(sphere.rgba, HEAT(size / 5) if size else HEAT(-1.0), atol=1e-6)
+    radii = np.array([sphere.size[0] for sphere in spheres])
+    width = np.sqrt(touch.taxels["touch"]["area"])
+    assert (radii < width / 2).all() and ((radii > width / 4) == (np.array(sizes) > 0)).all()  # what reads is larger
 
 
 def test_a_full_scene_gets_no_more_spheres(trace):
@@ -80,6 +83,14 @@ def test_a_full_scene_gets_no_more_spheres(trace):
     mujoco.mj_forward(model, data)
     trace.draw(scene, model, data, 1)
     assert scene.ngeom == 2
+
+
+def test_bars_name_links_and_the_largest_sum_and_are_full_in_the_hottest_colour(trace, monkeypatch):
+    frame = np.zeros((200, 400, 3), dtype=np.uint8)
+    hottest = trace.bars().draw(frame, 1)[-27, 130].astype(float)  # the left link's, which is full
+    np.testing.assert_allclose(hottest / hottest.max(), np.array(HEAT(1.0)[:3]) / HEAT(1.0)[0], atol=0.01)
+    monkeypatch.setattr("tgdsl.view.trace.LinkBars", lambda names, parts, title: (names, title))
+    assert trace.bars() == (("left", "right"), "Σ |force|, full: 6 N; spheres: up to 5")
 
 
 def test_the_most_pressed_links_have_bars(trace, monkeypatch):
