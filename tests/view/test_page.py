@@ -21,6 +21,7 @@ from box_hands import BOX_HAND
 from faulty_lines import FaultyEmulator
 from first_order_hands import first_order_hand
 from hand_logs import write_log
+from matplotlib.colors import to_hex
 from press_scene import DOCUMENT, SCENE, WITHOUT_PROXIMITY
 from scipy.spatial.transform import Rotation
 from silent_browser import silent_browser
@@ -45,7 +46,7 @@ from tgdsl.view.meshes import body_surfaces
 from tgdsl.view.page import MAX_STEPS, Page
 from tgdsl.view.picture import HeatMaps
 from tgdsl.view.stages import RunStage, SceneStage, Stage, contacts_of
-from tgdsl.view.style import LIVE_OBJECT, LIVE_OTHER, LIVE_REST, LIVE_SENSING
+from tgdsl.view.style import HEAT, LIVE_OBJECT, LIVE_OTHER, LIVE_REST, LIVE_SENSING
 
 ROOT = Path(__file__).parents[2]
 TWO_BALLS = "variants: [{type: sphere, size: [20 mm], density: 6000}, {type: sphere, size: [15 mm], density: 6000}]"
@@ -98,6 +99,8 @@ def test_the_most_pressed_taxel_has_the_hottest_colour_and_its_reading_is_shown(
         assert blue[hottest] == blue[is_read].min() < blue[is_read].max()
         np.testing.assert_array_equal((disc.batched_colors == LIVE_REST).all(axis=1), ~is_read)
         assert "|force| [N]" in page.panel.legend.content and "<span>0</span>" in page.panel.legend.content
+        stops = re.findall("#......", page.panel.legend.content)
+        assert (stops[0], stops[-1]) == (to_hex(HEAT(0.0)), to_hex(HEAT(1.0)))
         page.panel.channel.value = "force_z"
         page.draw()
         pressed = page.stage.readings["touch"][0, :, 2]
@@ -651,6 +654,8 @@ def test_temperatures_colour_the_surfaces_of_links(document, clicks):
         assert "temperature [°C]" in page.panel.legend.content and " cells" in page.panel.status.content
         assert page.panel.value.content.startswith(f"**pad, cell {values.argmax()}** at ")
         assert f"{values.max():.4g} °C" in page.panel.value.content
+        page._restart()
+        assert float(np.ptp(page.stage.readings["heat"].numpy())) < 1e-6  # the links have cooled
 
 
 def test_a_heat_map_has_its_distal_end_up_and_scattered_taxels_as_dots(document):
