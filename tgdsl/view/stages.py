@@ -193,7 +193,6 @@ class SceneStage(SimStage):
 
     def restart(self) -> None:
         self.sim.reset()
-        self.touch.reset()
         self._begin()
 
     def observed(self, group: str, env: int) -> Sequence[Observed]:
