@@ -100,7 +100,7 @@ def test_the_most_pressed_taxel_has_the_hottest_colour_and_its_reading_is_shown(
         np.testing.assert_array_equal((disc.batched_colors == LIVE_REST).all(axis=1), ~is_read)
         assert "|force| [N]" in page.panel.legend.content and "<span>0</span>" in page.panel.legend.content
         stops = re.findall("#......", page.panel.legend.content)
-        assert (stops[0], stops[-1]) == (to_hex(HEAT(0.0)), to_hex(HEAT(1.0)))
+        assert [stops[0], stops[len(stops) // 2], stops[-1]] == [to_hex(HEAT(part)) for part in (0.0, 0.5, 1.0)]
         page.panel.channel.value = "force_z"
         page.draw()
         pressed = page.stage.readings["touch"][0, :, 2]
