@@ -25,7 +25,6 @@ from tgdsl.module.outputs import Output
 from tgdsl.view.boxes import boxes_of, is_boxed, norm_between
 from tgdsl.view.markers import magnitude, quantity_of, read_now, rows_of
 from tgdsl.view.meshes import body_surfaces
-from tgdsl.view.sound import sounding
 from tgdsl.view.style import DISC_RADIUS, HEAT, LIVE_REST, WARMTH
 
 Array = np.ndarray
@@ -91,7 +90,7 @@ class Layer(ABC):
 
     @abstractmethod
     def read(self, readings: Tensor, env: int, channel: str) -> Shown:
-        """Return what one environment reads; of stacked calls the last one, of sound its root mean square."""
+        """Return what one environment reads; of stacked calls the last one."""
 
     @abstractmethod
     def paint(self, colour: UInt8[Array, "row 3"]) -> None:
@@ -152,7 +151,6 @@ class DiscLayer(Layer):
     ):
         super().__init__()
         self.output, self.channels = output, (MAGNITUDE, *output.channels)
-        self._is_sound = output.sensor in {sensor.name for sensor in sounding(touch.plan)}
         names, taxels = rows_of(touch, output)
         body = np.array([model.body(name).id for name in names], dtype=np.int64)
         table = touch.taxels[output.sensor]
@@ -174,11 +172,7 @@ class DiscLayer(Layer):
             self.members.append((handle, link, rows))
 
     def read(self, readings: Tensor, env: int, channel: str) -> Shown:
-        output = self.output
-        if self._is_sound:
-            values = readings[env].detach().double().square().mean(dim=0).sqrt().cpu().numpy()
-        else:
-            values = read_now(readings, env)
+        output, values = self.output, read_now(readings, env)
         if channel != MAGNITUDE:
             i = output.channels.index(channel)
             most = max(map(abs, self._widened(channel, values[:, i])))
