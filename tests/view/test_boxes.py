@@ -97,6 +97,9 @@ def test_the_picture_has_a_colour_bar_in_degrees(build, tmp_path):
     figure = overview_drawing(touch, sim, values, env=1, title="warm")
     panel = figure.axes[0]
     assert panel.get_title("left") == "heat  ·  temperature_grid"
+    red, _, blue = np.moveaxis(panel.images[0].get_array(), 2, 0)
+    assert (red - blue > 0.3).mean() > 0.05  # the warm cells
+    assert [text.get_text() for text in figure.texts] == ["warm"] and len(panel.lines) == 1
     assert "temperature 20.00 … 45.00 °C" in [text.get_text() for text in panel.texts]
     (bar,) = panel.child_axes
     assert bar.get_title() == "temperature [°C]"

@@ -498,7 +498,7 @@ def test_arrows_lead_from_the_taxels_along_their_forces(tmp_path):
 
 def test_parts_links_groups_and_sensors_can_be_switched_on_and_off(tmp_path):
     side = '<body name="side" pos="0 .1 .05"><geom name="side" type="box" size=".02 .02 .005" rgba="0 1 0 1"/></body>'
-    table = '<geom type="box" pos="0 0 -.1" size=".2 .2 .01"/>'
+    table = '<geom type="box" pos="0 0 -.1" size=".2 .2 .01" rgba="1 0 0 .5"/>'
     (tmp_path / "press.xml").write_text(SCENE.replace('<body name="ball"', f'{table}{side}<body name="ball"'))
     grid = "{method: grid, rows: 2, columns: 2, direction: [0, 0, -1], radius: 6 mm}"
     text = DOCUMENT.replace("{pad: {", f"{{side: {grid}, pad: {{").replace("{all: [pad]}", "{all: [pad, side], one: [side]}")
@@ -544,7 +544,9 @@ def test_parts_links_groups_and_sensors_can_be_switched_on_and_off(tmp_path):
         robot = {"world": (True, LIVE_OTHER), "pad": (True, LIVE_SENSING), "side": (True, LIVE_SENSING)}
         assert meshes() == {**robot, "ball": (True, LIVE_OBJECT)}
         page.panel.is_plain.value = False
-        assert meshes() == {**robot, "side": (True, (0, 255, 0)), "ball": (True, LIVE_OBJECT)}
+        painted = {"world": (True, (255, 0, 0)), "side": (True, (0, 255, 0))}
+        assert meshes() == {**robot, **painted, "ball": (True, LIVE_OBJECT)}
+        assert [page.scene._meshes[body][0][0].opacity for body in range(3)] == [0.5, None, None]
         page.panel.parts["robot"].value = False
         assert {name for name, (is_visible, _) in meshes().items() if is_visible} == {"ball"}
         page.panel.parts["objects"].value = False
