@@ -21,6 +21,8 @@ SCENE = """
   <body name="ball" pos="0 0 1"><freejoint/><geom type="sphere" size=".03"/></body>
 </worldbody></mujoco>
 """
+PADS = {"upper": 0.01, "lower": -0.01}
+"""Heights of two pads that face away from each other [m]."""
 
 
 @pytest.fixture
@@ -117,6 +119,31 @@ def test_each_active_panel_has_a_colour_bar(scene):
     (bar,) = depth.child_axes
     assert bar.get_title() == "depth [mm]   (grey: up to 1 µm)"
     np.testing.assert_allclose(bar.get_xlim(), (0, 3), rtol=1e-6)
+
+
+def test_the_camera_faces_taxels_that_read_rather_than_a_body_that_does(tmp_path):
+    """Two pads back to back: the first reading is of the upper one as a whole, the second of the taxels of the lower one."""
+    pads = "".join(
+        f'<body name="{name}" pos="0 0 {z}"><geom type="box" size=".02 .02 .004"/></body>' for name, z in PADS.items()
+    )
+    ball = '<body name="ball" pos="0 0 1"><freejoint/><geom size=".03"/></body>'
+    (tmp_path / "pads.xml").write_text(f'<mujoco><worldbody><body name="arm">{pads}</body>{ball}</worldbody></mujoco>')
+    grid = {"method": "grid", "rows": 2, "columns": 2, "radius": 0.004}
+    layout = {name: {**grid, "direction": [0, 0, -np.sign(z)]} for name, z in PADS.items()}
+    touch = tgdsl.compile(
+        {
+            "tgdsl": 1,
+            "robot": {"model": str(tmp_path / "pads.xml"), "layout": {"resolutions": {"r": layout}}},
+            "objects": {"ball": {"body": "ball"}},
+            "sensors": {
+                "net": {"kind": "link_contact", "links": "upper", "feels": ["ball"], "outputs": ["force"]},
+                "depth": {"kind": "contact_depth", "links": "*", "feels": ["ball"]},
+            },
+        }
+    )
+    depth = torch.from_numpy(np.where(touch.taxels["depth"]["link"] == "lower", 1e-3, 0.0))[None, :, None]
+    _, axes = drawing(touch, tgdsl.simulate(touch, 1), {"net": torch.ones(1, 1, 3), "depth": depth}).axes
+    assert [len(part.get_offsets()) for part in axes.collections] == [0, 0, 4]  # the four that read are in front
 
 
 def test_a_missing_environment_or_reading_is_refused(scene, tmp_path):
