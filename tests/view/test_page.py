@@ -242,6 +242,7 @@ def recording(document, tmp_path_factory) -> Path:
 def test_a_recorded_run_has_mujocos_poses(document, recording):
     touch = tgdsl.compile(document)
     stage = RunStage(touch, recording)
+    assert stage.step_index == 0
     with np.load(recording) as arrays:
         qpos, readings = arrays["qpos"], arrays["touch"]
     model = mujoco.MjModel.from_xml_string(SCENE)
@@ -791,7 +792,7 @@ def test_a_hands_log_has_its_angles_and_forces(tmp_path):
     path, position, counts = hand_log(tmp_path / "log.npz")
     stage = View(path)._stage()
     assert isinstance(stage, HandLogStage)
-    assert stage.num_steps == 5 and stage.control_step == pytest.approx(0.01)
+    assert stage.step_index == 0 and stage.num_steps == 5 and stage.control_step == pytest.approx(0.01)
     for step, expected in ((-1, 0), (99, 4), (2, 2)):
         stage.seek(step)
         assert stage.step_index == expected and stage.time == pytest.approx(0.01 * expected)

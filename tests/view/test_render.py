@@ -276,6 +276,9 @@ def test_panels_are_side_by_side_and_as_wide_as_the_hand_needs(hand: Drawn, monk
         for axis in (0, 1):
             drawn = np.flatnonzero(is_hand.any(axis=axis)) / is_hand.shape[1 - axis]
             assert 0 < drawn[0] < 0.03 and 0.97 < drawn[-1] < 1
+    (bar,) = left.lines
+    row = left.transAxes.inverted().transform(left.transData.transform(bar.get_xydata()))[:, 1]
+    assert (row > 1).all() and (row * left.get_position().height + left.get_position().y0 < 1).all()  # between panel and edge
     left, right = left.get_position(), right.get_position()
     assert 0 < left.x0 < left.x1 < right.x0 < right.x1 < 1 and left.width == pytest.approx(right.width)
     assert left.x0 == pytest.approx(1 - right.x1, abs=0.01)
