@@ -43,7 +43,7 @@ from tgdsl.view.hand_stage import HandLogStage, LiveHandStage
 from tgdsl.view.layout_page import LayoutPage
 from tgdsl.view.live_scene import ARROW
 from tgdsl.view.meshes import body_surfaces
-from tgdsl.view.page import MAX_STEPS, Page
+from tgdsl.view.page import Page
 from tgdsl.view.picture import HeatMaps
 from tgdsl.view.stages import RunStage, SceneStage, Stage, contacts_of
 from tgdsl.view.style import HEAT, LIVE_OBJECT, LIVE_OTHER, LIVE_REST, LIVE_SENSING
@@ -224,8 +224,16 @@ def test_a_scene_runs_in_real_time_times_the_speed(document, monkeypatch):
         assert 0.65 < elapsed <= 0.7  # the first frame has no step
         page.panel.speed.value = 0.5
         assert run(0.7)[1] == pytest.approx(0.35, abs=0.03)
+        page.panel.speed.value = 4.0
+        assert run(0.7)[1] == pytest.approx(2.8, abs=0.2)
+        page.panel.speed.value = 1.0
         frames, elapsed = run(1.0, work=0.5)
-        assert frames == 2 and elapsed == pytest.approx(MAX_STEPS * page.stage.control_step)
+        assert frames == 2 and elapsed == pytest.approx(0.5, abs=0.011)
+        with monkeypatch.context() as slow:
+            slow.setattr(page, "_advance", lambda: (page.stage.advance(), wait(0.02)))
+            frames, elapsed = run(1.0)
+        assert frames == pytest.approx(25, abs=1)  # two steps, the second of which ends after a frame's 33 ms
+        assert elapsed == pytest.approx(2 * frames * page.stage.control_step, abs=0.03)
         page.panel.paused.value = True
         assert run(0.3)[1] == 0
 
@@ -385,7 +393,9 @@ def test_the_plot_restarts_with_another_environment_channel_or_an_earlier_time(d
         for time_then in (22.0, 23.0):  # of a recorded run
             page.stage.time = time_then
             page.draw()
-        np.testing.assert_array_equal(page.panel.plot.data[0], [22, 23])
+        np.testing.assert_array_equal(page.panel.plot.data[0], [20, 22, 23])
+        page.draw()
+        assert len(page._history) == 3  # a paused scene adds no points
         page.panel.channel.value = "force_x"
         page._react()
         assert not page._history

@@ -40,7 +40,6 @@ SPECTROGRAM = (128, 340)  # its rows and columns of pixels
 SOUND_SECONDS = 3.0  # how much of the past the spectrogram shows [s]
 SAVED_FRAMES = 1800  # number of frames that the page can save: the last minute at 30 per second
 NETWORK_WARNING = "the page is served at {}: whoever reaches this machine can see and control it"
-MAX_STEPS = 5  # most control steps per frame: a scene slower than that runs behind real time
 VIDEO_RATE = 10.0  # frames per second of a video at most
 VIDEO_SECONDS = 60.0  # how long a video is at most [s]
 _VIDEO_ROWS = 400  # rows of pixels of a video
@@ -129,10 +128,11 @@ class Page:
             self._react()
             due = 0.0 if self.panel.paused.value else due + self.panel.speed.value * (start - last_frame)
             last_frame = start
-            steps = min(MAX_STEPS, int(due / self.stage.control_step))
-            due = min(due - steps * self.stage.control_step, self.stage.control_step)
-            for _ in range(steps):
+            deadline = time.monotonic() + FRAME
+            while due >= self.stage.control_step and time.monotonic() < deadline:
                 self._advance()
+                due -= self.stage.control_step
+            due = min(due, self.stage.control_step)  # a scene of slow steps runs behind real time
             self.draw()
             time.sleep(max(0.0, FRAME - (time.monotonic() - start)))
 
@@ -199,8 +199,8 @@ class Page:
             name = f"**{layer.total}**" if panel.plotted.value == EVERY else f"**{layer.total} of {panel.plotted.value}**"
             self.scene.name_row(rows, None, poses)
         panel.value.content = f"{name}: {current.quantity} {value:.4g} {current.unit}"
-        if self._history and self.stage.time < self._history[-1][0]:
-            self._history.clear()
+        while self._history and self.stage.time <= self._history[-1][0]:
+            self._history.pop()
         self._history.append((self.stage.time, value))
         while self.stage.time - self._history[0][0] > PLOT_SECONDS:
             self._history.popleft()

@@ -77,7 +77,7 @@ def drawing(
     links.sort(key=lambda link: -markers.value[table["link"] == link].sum())
     names = short_names(links)
     if len(links) > MAX_MAPS:
-        rest = f"and {len(links) - MAX_MAPS} more links, touched less or not at all"
+        rest = f"not shown: {len(links) - MAX_MAPS} of {len(links)} links, touched less or not at all"
         figure.text(0.985, 0.912, rest, size=10.5, color=FAINT, ha="right", va="center")
     maps = {link: np.flatnonzero(table["link"] == link) for link in links[:MAX_MAPS]}
     axes, scene = figure.add_axes(VIEW), rendered(seen(touch, sim, markers, env, width, height, view))
