@@ -298,7 +298,7 @@ def test_the_one_pad_that_is_touched_is_faced(tmp_path, pad):
 def test_names_of_links_are_at_the_nearer_edge_with_a_line_to_the_taxels(tmp_path, monkeypatch):
     monkeypatch.setattr("tgdsl.view.picture.SIZE", (4.0, 2.25))  # of few pixels, which take less time
     touch, sim = gripper(tmp_path, 1)
-    axes = picture_of(touch, sim, {"touch": torch.ones(1, 24, 3)}).axes[0]
+    axes, *maps, _ = picture_of(touch, sim, {"touch": torch.ones(1, 24, 3)}).axes
     places = np.concatenate([part.get_offsets() for part in axes.collections])
     is_left = places[:, 0] < places[:, 0].mean()
     left, right = sorted((text for text in axes.texts if text.get_text() in ("left", "right")), key=lambda text: text.xy[0])
@@ -307,6 +307,9 @@ def test_names_of_links_are_at_the_nearer_edge_with_a_line_to_the_taxels(tmp_pat
         np.testing.assert_allclose(text.xy, places[is_side].mean(axis=0), atol=1e-6)
         assert text.get_position() == (edge, text.xy[1])
     assert (left.get_ha(), right.get_ha()) == ("left", "right")
+    for each in maps:
+        assert each.get_position().y1 < 0.9  # below the title
+        assert each.get_aspect() == 2.5  # cells of 20 mm × 5 mm; more would be too narrow
 
 
 @pytest.mark.slow

@@ -744,7 +744,7 @@ def test_observations_are_live_values_and_sound_has_a_spectrogram(document):
 def test_a_task_moves_by_policy_or_by_hand():
     task = View(ROOT / "examples/tasks/in_palm_rotate_cube.yaml")._stage()
     with opened(task) as page:
-        assert page.panel.by_hand is not None
+        assert page.panel.by_hand is not None and not page.panel.by_hand.value
         task.advance()
         page._react()
         assert [slider.value for slider in page.panel.sliders] == [0.0] * len(task.env.joint_names)  # without a policy
